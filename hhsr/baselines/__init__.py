@@ -1,0 +1,1 @@
+"""Comparators with the interface of a fit: what HHSR is measured against."""

@@ -1,0 +1,1 @@
+"""Compiled kernels on plain floats and arrays: numpy, numba and math only."""

@@ -1,0 +1,1 @@
+"""Rebuild the surface of a tree as one closed mesh (PAPER Algorithm 2)."""
