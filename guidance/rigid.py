@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from devices.rotation import is_rigid
 from guidance.errors import InputError
 
 __all__ = ["check_rigid", "invert", "is_rigid", "pose", "rotation_angle_rad", "transform_points"]
@@ -18,27 +19,6 @@ def _departure(T: NDArray[np.float64]) -> tuple[float, float, bool]:
     """Largest entry of |R Rᵀ − 1|, determinant of R, and whether the last row is (0, 0, 0, 1)."""
     R = T[:3, :3]
     return float(np.abs(R @ R.T - np.eye(3)).max()), float(np.linalg.det(R)), bool((T[3] == (0.0, 0.0, 0.0, 1.0)).all())
-
-
-def is_rigid(T: ArrayLike | None, tolerance: float = 1e-3) -> bool:
-    """Tell whether `T` is a finite rigid transform; never raises.
-
-    Parameters
-    ----------
-    T : (4, 4) array_like or None
-        Anything; what is not a finite (4, 4) matrix of numbers is not rigid.
-    tolerance : float
-        Largest allowed entry of ``|R @ R.T - 1|``. The default accepts what trackers send in text (1e-4 per quaternion
-        component) and refuses scalings of 0.1 %.
-    """
-    try:
-        matrix = np.asarray(T, dtype=np.float64)
-    except (TypeError, ValueError):
-        return False
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        return False
-    departure, determinant, last_row = _departure(matrix)
-    return departure <= tolerance and determinant > 0.0 and last_row
 
 
 def check_rigid(T: ArrayLike, name: str, tolerance: float = 1e-3) -> NDArray[np.float64]:
