@@ -7,9 +7,10 @@ Everything here is a number that is stored, and nothing else: what queries need 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -50,9 +51,9 @@ class Superquadric:
     """Extended superquadric about the origin of its leaf's frame.
 
     half_axes: (6,) mm, a₊ a₋ b₊ b₋ c₊ c₋, all > 0.
-    azimuth_logits: (n,) logits of ε2 at θ = −π + 2π·i/n, periodic cubic spline; empty: ε2 ≡ 1; one: constant; else n ≥ 3.
-    elevation_logits: (m,) logits of ε1 at φ = −π/2 + π·i/(m−1), cubic spline flat at both poles; empty: ε1 ≡ 1; one:
-    constant; else m ≥ 2.
+    azimuth_logits: (n,) logits of ε2 at θ = −π + 2π·i/n, periodic cubic spline; empty: ε2 ≡ 1; one: constant; or n ≥ 3.
+    elevation_logits: (m,) logits of ε1 at φ = −π/2 + π·i/(m−1), cubic spline, flat at the poles; empty, one: as above;
+    or m ≥ 2.
     """
 
     half_axes: FloatArray
@@ -284,3 +285,30 @@ def rotation_matrix(vector: ArrayLike) -> FloatArray:
     x, y, z = v / angle
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+
+
+class ErrorFigures(NamedTuple):
+    """Two-sided true distance between a fit and its source, mm: mean, 95th percentile, sampled maximum."""
+
+    mean_mm: float
+    p95_mm: float
+    max_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Provenance:
+    """Where a shape comes from and how well it fits; the file's header, not counted as parameters.
+
+    source_hash: SHA-256 of the source's bytes or arrays, hex. frame: of the source as read ("LPS" where nothing was
+    flipped). label: of a label map. options: of the fit, JSON values. fit_error, leaf_errors: measured on what is
+    stored; leaf order as `leaves`. report: further figures of the fit, JSON values (seconds excepted: no timestamps).
+    """
+
+    source_hash: str = ""
+    frame: str = "LPS"
+    label: int | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+    software: str = ""
+    fit_error: ErrorFigures | None = None
+    leaf_errors: tuple[ErrorFigures, ...] = ()
+    report: Mapping[str, Any] = field(default_factory=dict)

@@ -25,7 +25,7 @@ def periodic_coefficients(values):
 
 
 def clamped_coefficients(values):
-    """Return (m − 1, 4) coefficients of the spline through (m,) values with slope 0 at both ends; (1, 4) for one value."""
+    """Return (m − 1, 4) coefficients of the spline through (m,) values, flat at both ends; (1, 4) for one."""
     m = len(values)
     if m <= 1:
         return np.array([[v, 0.0, 0.0, 0.0] for v in values]).reshape(m, 4)

@@ -1,4 +1,4 @@
-"""The extended superquadric as a norm that is homogeneous of degree 1: N(p) = |p| / q(p/|p|) (PAPER Eq. 2, DESIGN §1)."""
+"""The extended superquadric as a norm, homogeneous of degree 1: N(p) = |p| / q(p/|p|) (PAPER Eq. 2, DESIGN §1)."""
 
 import math
 
