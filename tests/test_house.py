@@ -56,7 +56,9 @@ def test_only_the_system_clock_reads_a_clock() -> None:
     for path in SOURCES:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "time":
-                allowed = {"perf_counter"} | ({"monotonic", "time", "sleep"} if path.parts[-2:] == ("devices", "clock.py") else set())
+                allowed = {"perf_counter"} | (
+                    {"monotonic", "time", "sleep"} if path.parts[-2:] == ("devices", "clock.py") else set()
+                )
                 assert node.attr in allowed, f"{path.relative_to(ROOT)}:{node.lineno} reads time.{node.attr}"
 
 
@@ -67,7 +69,14 @@ def test_every_imported_package_is_declared() -> None:
     for extra in project["optional-dependencies"].values():
         listed += extra
     declared = {d.split(">")[0].split("[")[0].split("=")[0].lower().replace("-", "_") for d in listed}
-    alias = {"serial": "pyserial", "skimage": "scikit_image", "yaml": "pyyaml", "mpl_toolkits": "matplotlib", "igl": "libigl", "DracoPy": "dracopy"}
+    alias = {
+        "serial": "pyserial",
+        "skimage": "scikit_image",
+        "yaml": "pyyaml",
+        "mpl_toolkits": "matplotlib",
+        "igl": "libigl",
+        "DracoPy": "dracopy",
+    }
     import sys
 
     for path in SOURCES:

@@ -5,8 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-LOW = 0.1
-RANGE = 1.8
+HALF_RANGE = 0.9
 
 
 def periodic_coefficients(values):
@@ -45,7 +44,7 @@ def _hermite(v0, v1, s0, s1):
 def exponent_and_slope(coefficients, share):
     """Return (ε, dε/dshare) at share ∈ [0, 1] of the knots' range; (1, 0) where there are no knots.
 
-    ε = 0.1 + 1.8 / (1 + e^−S(share)): in range without a clip, which would break the Jacobian.
+    ε = 1 + 0.9·tanh(S(share)/2) = 0.1 + 1.8/(1 + e^−S): in [0.1, 1.9] without a clip, which would break the Jacobian.
     """
     n = coefficients.shape[0]
     if n == 0:
@@ -61,5 +60,5 @@ def exponent_and_slope(coefficients, share):
     )
     value = c0 + x * (c1 + x * (c2 + x * c3))
     slope = (c1 + x * (2.0 * c2 + 3.0 * x * c3)) * n
-    sigmoid = 1.0 / (1.0 + math.exp(-value))
-    return LOW + RANGE * sigmoid, RANGE * sigmoid * (1.0 - sigmoid) * slope
+    squash = math.tanh(0.5 * value)
+    return 1.0 + HALF_RANGE * squash, 0.5 * HALF_RANGE * (1.0 - squash * squash) * slope
