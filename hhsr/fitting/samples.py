@@ -76,7 +76,7 @@ def turned_fibonacci(count: int, seed: int = 0) -> FloatArray:
     turn = math.pi * (3.0 - math.sqrt(5.0)) * index
     ring = np.sqrt(1.0 - z * z)
     even = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
-    basis = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))[0]
+    basis: FloatArray = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))[0]
     turned: FloatArray = np.einsum("ij,nj->ni", basis, even)
     return turned
 

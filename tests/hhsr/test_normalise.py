@@ -19,7 +19,9 @@ def lopsided() -> tuple[np.ndarray, np.ndarray]:
     """A closed body with three different axes and no mirror plane."""
     ball = trimesh.creation.icosphere(subdivisions=3)
     v = np.array(ball.vertices)
-    v *= 1.0 + 0.2 * v[:, [0]] + 0.15 * v[:, [1]] + 0.1 * v[:, [2]] * v[:, [0]]
+    v[:, 0] = np.expm1(v[:, 0])
+    v[:, 1] = np.expm1(v[:, 1])
+    v[:, 2] += 0.1 * v[:, 0]
     return v * (40.0, 25.0, 12.0), np.array(ball.faces)
 
 
