@@ -1,0 +1,100 @@
+"""First contact ahead: when the moving capsule meets a shape, as an interval that means it.
+
+The axis predicted for a time ahead is a segment. Its distance to the shape changes no faster than its ends move, so
+stepping ahead by (gap / speed) never jumps over a contact. Three such walks run side by side: the capsule as
+predicted, the capsule grown by k standard deviations of the prediction (no contact can come earlier), and the capsule
+shrunk by as much (contact has come by then).
+"""
+
+from __future__ import annotations
+
+from math import inf
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from guidance.limits import Limits
+from guidance.motion import Motion
+from guidance.needle import Array, Needle
+from guidance.states import Forecast
+
+if TYPE_CHECKING:
+    from hhsr import Shape
+
+_TOUCH_MM = 0.02  # a gap this small is contact: twice the tolerance of the shape's clearance
+_STEPS = 60
+_SAMPLES = np.linspace(0.0, 1.0, 17)
+
+
+def forecast_contact(shape: Shape, needle: Needle, motion: Motion, limits: Limits, age_s: float) -> Forecast:
+    """When the needle will first touch a shape if it goes on as it moves now.
+
+    Parameters
+    ----------
+    shape : hhsr.Shape
+        LPS, mm.
+    needle : Needle
+    motion : Motion
+        In the patient's frame.
+    limits : Limits
+    age_s : float
+        How old the motion is at the time from which the forecast counts.
+
+    Returns
+    -------
+    Forecast
+        All inf where nothing is met within the horizon. The interval leaves out what a hand may decide to do.
+    """
+    horizon = limits.horizon_s
+    sideways = needle.length_mm * float(np.linalg.norm(motion.direction.rate))
+    speed = motion.speed_mm_s + sideways
+    grid = np.linspace(0.0, horizon, 17)
+    lever = 0.0
+    growth = _growth(motion, limits, grid, lever)
+    start = float(shape.clearance(*_one(motion, 0.0, needle), needle.radius_mm))
+    if start > speed * horizon + growth.max() + _TOUCH_MM:
+        return Forecast()
+    nominal = _walk(shape, needle, motion, horizon, speed, np.zeros(len(grid)), grid, start)
+    at = min(nominal, horizon)
+    hub, tip = _one(motion, at, needle)
+    nearest = shape.signed_distance(tip + _SAMPLES[:, None] * (hub - tip))
+    lever = float(_SAMPLES[int(np.argmin(nearest))]) * needle.length_mm
+    growth = _growth(motion, limits, grid, lever)
+    earliest = _walk(shape, needle, motion, horizon, speed, growth, grid, start)
+    latest = _walk(shape, needle, motion, horizon, speed, -growth, grid, start) if nominal < inf else inf
+    return Forecast(
+        seconds=max(nominal - age_s, 0.0),
+        earliest_s=max(earliest - age_s - limits.timing_s, 0.0),
+        latest_s=max(latest - age_s + limits.timing_s, 0.0),
+        travel_mm=max(nominal, 0.0) * motion.speed_mm_s,
+    )
+
+
+def _one(motion: Motion, ahead_s: float, needle: Needle) -> tuple[Array, Array]:
+    hubs, tips = motion.axis(np.array([ahead_s]), needle.length_mm)
+    return hubs[0], tips[0]
+
+
+def _growth(motion: Motion, limits: Limits, grid: Array, lever_mm: float) -> Array:
+    """By how much (mm) the predicted capsule may be off at the times of the grid, at the stated coverage."""
+    spread = [np.hypot(motion.tip.spread(t), lever_mm * motion.direction.spread(t)) for t in grid]
+    return limits.coverage_sigmas * np.asarray(spread)
+
+
+def _walk(
+    shape: Shape, needle: Needle, motion: Motion, horizon: float, speed: float, growth: Array, grid: Array, start: float
+) -> float:
+    """The first time (s) at which the capsule, grown by `growth` over `grid`, touches the shape; inf if none."""
+    steepest = float(np.abs(np.diff(growth)).max() / (grid[1] - grid[0])) if len(grid) > 1 else 0.0
+    rate = max(speed + 1.1 * steepest, 1e-6)
+    time, distance = 0.0, start
+    for _ in range(_STEPS):
+        gap = distance - float(np.interp(time, grid, growth))
+        if gap <= _TOUCH_MM:
+            return time
+        time += gap / rate
+        if time > horizon:
+            return inf
+        distance = float(shape.clearance(*_one(motion, time, needle), needle.radius_mm))
+    # grazing: the walk has not finished. No contact lies before this time, and nothing proves one after it.
+    return time if growth[-1] >= 0.0 else inf
