@@ -1,4 +1,4 @@
-"""Building a bounding-volume hierarchy over triangles by the surface-area heuristic (arrays: `hhsr.kernels.triangles`)."""
+"""Building a bounding-volume hierarchy over triangles by the surface-area heuristic (see `hhsr.kernels.triangles`)."""
 
 import numpy as np
 from numba import njit
