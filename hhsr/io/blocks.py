@@ -99,6 +99,8 @@ class Reader:
         """Return (count,) floats of a block."""
         if count == 0:
             return np.zeros(0)
+        if count > 8 * self.left:  # each takes a bit at least: never allocate for more
+            raise FileFormatError(f"a block of {count} numbers does not fit in {self.left} bytes")
         head = self.raw(1)[0]
         kind, signed, width = head & 3, bool(head & _SIGNED), head >> 3
         if kind in (F8, F4):
@@ -131,9 +133,6 @@ class Reader:
         return bits @ (np.int64(1) << np.arange(width - 1, -1, -1, dtype=np.int64))
 
     def _rice(self, count: int, width: int) -> IntArray:
-        # Every value takes a bit at least: `count` ones must lie in what is left, and no more than that is unpacked.
-        if count > 8 * self.left:
-            raise FileFormatError(f"a block of {count} numbers does not fit in {self.left} bytes")
         longest = min(((_MAX_QUOTIENT + 1) * count) // 8 + 1, self.left)
         unary = np.frombuffer(self._data, dtype=np.uint8, count=longest, offset=self._at)
         ones = np.flatnonzero(np.unpackbits(unary))[:count]
