@@ -55,7 +55,8 @@ class Phantom:
         folder.mkdir(parents=True, exist_ok=True)
         affine = np.diag([-self.spacing_mm, -self.spacing_mm, self.spacing_mm, 1.0])
         affine[:3, 3] = self.origin * [-1.0, -1.0, 1.0]
-        nibabel.save(nibabel.Nifti1Image(self.labels, affine), folder / "labels.nii.gz")
+        image = nibabel.Nifti1Image(self.labels, affine)  # type: ignore[no-untyped-call]
+        nibabel.save(image, folder / "labels.nii.gz")
         files = {}
         for name, mesh in self.meshes.items():
             files[name] = folder / f"{name.replace(' ', '_')}.ply"
@@ -258,7 +259,7 @@ def _grid(low: Array, high: Array, spacing: float) -> Array:
 def _surface(field: Field, box: tuple[Array, Array], spacing: float) -> trimesh.Trimesh:
     values = field(_grid(box[0], box[1], spacing))
     values = np.pad(values, 1, constant_values=spacing)
-    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(spacing,) * 3)
+    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(spacing,) * 3)  # type: ignore[no-untyped-call]
     mesh = trimesh.Trimesh(vertices + box[0] - spacing, faces, process=True)
     mesh.update_faces(mesh.nondegenerate_faces())
     if mesh.volume < 0.0:

@@ -57,7 +57,7 @@ class PoseGate:
         return self._place(frame.time_s, T)
 
     def _is_restarted(self, frame: TrackerFrame) -> bool:
-        """A tracker that was started again counts from the beginning: believe it once its data would be stale anyway."""
+        """A tracker started anew counts from the beginning: believe it once its past would be stale anyway."""
         return frame.time_s > self._time_s + self._limits.stale_s
 
     def _distrust(self, frame: TrackerFrame) -> str:

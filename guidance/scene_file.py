@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,7 +67,7 @@ def _scene(document: Table, path: Path, shapes: Path | None, progress: Callable[
     errors = _errors(_table(document, "errors"))
     for t in tables:
         _check_keys(t, "structure")
-    names = [_text(t, "name", "structure", required=True) for t in tables]
+    names = [str(_text(t, "name", "structure", required=True)) for t in tables]
     if len(set(names)) < len(names):
         raise SceneError(f"two structures share a name; there are {', '.join(names)}")
     target_table, entry_table = _table(document, "target"), _table(document, "entry")
@@ -133,7 +134,7 @@ def _target(table: Table, structures: tuple[Structure, ...]) -> Target:
 
 def _entry(table: Table, target: Target) -> Entry:
     _check_keys(table, "entry")
-    points = np.zeros((0, 3))
+    points: Array = np.zeros((0, 3))
     if "points" in table:
         try:
             points = np.asarray(table["points"], dtype=np.float64)
@@ -157,7 +158,7 @@ def _entry(table: Table, target: Target) -> Entry:
 
 
 def _template(table: Table, target: Target) -> Array:
-    """The holes (n, 3) of a template: a grid in the plane across `direction`, centred on `centre` or below the target."""
+    """The holes (n, 3) of a template: a grid in the plane across `direction`, about `centre` or below the target."""
     where = "entry.template"
     _check_keys(table, where)
     direction = _vector(table, "direction", where) if "direction" in table else np.array([0.0, 0.0, 1.0])
@@ -190,8 +191,8 @@ def _template(table: Table, target: Target) -> Array:
 def _errors(table: Table) -> ErrorBudget:
     _check_keys(table, "errors")
     fit = _text(table, "fit", "errors")
-    parts = _numbers({k: v for k, v in table.items() if k != "fit"}, "errors")
-    return ErrorBudget(**parts, **({} if fit is None else {"fit": fit}))
+    budget = replace(ErrorBudget(), **_numbers({k: v for k, v in table.items() if k != "fit"}, "errors"))
+    return budget if fit is None else replace(budget, fit=fit)
 
 
 def _check_keys(table: Table, where: str) -> None:

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from guidance.needle import Array
-from guidance.scene import Scene
-from guidance.trajectory import Trajectory
 from guidance.planning.candidates import Candidates, aim_offsets, make_candidates
 from guidance.planning.constraints import Clearances, Verdict, clearance_reason, judge
 from guidance.planning.costs import WEIGHTS, cost_terms, pareto_front, total_cost, touch_probability
 from guidance.planning.plans import PathClearance, Plan, Plans, Rejection
+from guidance.scene import Scene
+from guidance.trajectory import Trajectory
 
 __all__ = ["PathClearance", "Plan", "Plans", "Rejection", "plan"]
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from guidance.budget import fit_error_range_mm, fit_errors_mm
 from guidance.errors import SceneError
 from guidance.needle import Array, Needle
-from guidance.scene import Scene, Structure
 from guidance.planning.candidates import Candidates
+from guidance.scene import Scene, Structure
 
 if TYPE_CHECKING:
     from hhsr import Shape
@@ -60,7 +60,7 @@ class Verdict:
     @property
     def feasible(self) -> NDArray[np.bool_]:
         """Candidates that no constraint rules out."""
-        return ~np.any(np.stack(list(self.fails.values())), axis=0)
+        return np.asarray(~np.any(np.stack(list(self.fails.values())), axis=0))
 
 
 def judge(scene: Scene, candidates: Candidates) -> Verdict:

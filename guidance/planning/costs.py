@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from guidance.budget import ErrorBudget
 from guidance.needle import Array
-from guidance.scene import Scene
 from guidance.planning.candidates import Candidates
 from guidance.planning.constraints import Verdict
+from guidance.scene import Scene
 
 SURPLUS_SCALE_MM = 3.0  # a surplus of 3 mm over what is needed is worth e times less worry than none
 WEIGHTS: Mapping[str, float] = {"clearance": 1.0, "depth": 0.5, "angle": 0.25}
