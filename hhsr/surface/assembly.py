@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import trimesh
 
 from hhsr.check import as_float
 from hhsr.model import Cut, FloatArray, IntArray, ModelLeaf, Node, RetainedPart, Tree, cuts, leaves, rotation_matrix
+from hhsr.surface.blend import outline, slab_body
 from hhsr.surface.piece import Bodies, Piece
 from hhsr.surface.polish import polish
 from hhsr.surface.sample import Halfspace, tessellate
-from hhsr.surface.sources import Patch, Retained, Source, Step
+from hhsr.surface.sources import Patch, Retained, Source, Step, Strip
 
 # Vertices are on the surface and facets are chords, so all misses point inwards: a share of what was asked keeps the
 # mean far below it (measured: mean radial miss 0.39 of the edge tolerance).
@@ -19,13 +22,18 @@ FURTHEST = 10.0  # tolerances that a vertex may be moved when it is put back ont
 SHORTEST = 0.01  # tolerances: shorter edges are collapsed at the end
 
 
-def reconstruct(tree: Tree, tolerance_mm: float = 0.02) -> trimesh.Trimesh:
+# For each cut, in the order of `hhsr.model.cuts`, and each of its lobes: (256,) mm radii at h = −d and at h = +d.
+BandTables = Sequence[Sequence[tuple[FloatArray, FloatArray]]]
+
+
+def reconstruct(tree: Tree, tolerance_mm: float = 0.02, band_tables: BandTables | None = None) -> trimesh.Trimesh:
     """Return the boundary of a tree's solid as one closed mesh in LPS, mm, outward.
 
     Parameters
     ----------
     tree : Tree
     tolerance_mm : how far facets may lie from the exact surface; vertices lie on it.
+    band_tables : the ends of the bands, where the caller has them (`hhsr.compiled`); else they are made.
 
     Returns
     -------
@@ -35,7 +43,7 @@ def reconstruct(tree: Tree, tolerance_mm: float = 0.02) -> trimesh.Trimesh:
         `metadata["unpolished"]`: number of vertices where the exact surfaces have no common point near by.
     """
     tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-4, 100.0)
-    assembly = _Assembly(tree, tolerance)
+    assembly = _Assembly(tree, tolerance, band_tables)
     piece = assembly.node(tree.root, [])
     if len(piece.faces):
         piece = assembly.bodies.simplified(piece, SHORTEST * tolerance)
@@ -54,7 +62,8 @@ def reconstruct(tree: Tree, tolerance_mm: float = 0.02) -> trimesh.Trimesh:
 class _Assembly:
     """One run of Algorithm 2: the numbering of sources, and the way up the tree."""
 
-    def __init__(self, tree: Tree, tolerance_mm: float) -> None:
+    def __init__(self, tree: Tree, tolerance_mm: float, band_tables: BandTables | None) -> None:
+        self.tree, self._tables = tree, band_tables
         self.tolerance = tolerance_mm
         self.bodies = Bodies()
         self.sources: list[Source] = []
@@ -84,11 +93,9 @@ class _Assembly:
         right = self.node(cut.right, [*region, Halfspace(-cut.normal, -cut.offset - d)])
         left_step = self._new(Step(number, -1 if d > 0 else 0, cut))
         right_step = self._new(Step(number, 1, cut)) if d > 0 else left_step
-        parts = [
-            self._side(cut, left, -1, left_step),
-            self._side(cut, right, 1, right_step),
-        ]
-        whole = self.bodies.united(parts)
+        below, above = self._side(cut, left, -1, left_step), self._side(cut, right, 1, right_step)
+        bands = self._bands(cut, below, above, (left_step, right_step)) if d > 0 else []
+        whole = self.bodies.united([below, above, *bands])
         crossing = self._where_many_meet(whole, d)
         return to_tree(cut, self._polished(cut, whole, crossing))
 
@@ -97,6 +104,24 @@ class _Assembly:
         height = side * cut.half_width
         trimmed = self.bodies.trimmed(to_cut(cut, piece), side, height, step)
         return self._polished(cut, trimmed, trimmed.vertices[:, 2] == height)
+
+    def _bands(self, cut: Cut, below: Piece, above: Piece, steps: tuple[int, int]) -> list[Piece]:
+        """Return the bodies of a cut's lobes."""
+        number, d = self.cut_number[id(cut)], cut.half_width
+        edges = outline(below, -d, up=True), outline(above, d, up=False)
+        bodies = []
+        for lobe, (left, right) in enumerate(self._band_tables()[number]):
+            strip = Strip(number, lobe, cut, left, right)
+            source = self._new(strip)
+            bodies.append(slab_body(strip, *edges, source, steps, EDGE_SHARE * self.tolerance))
+        return bodies
+
+    def _band_tables(self) -> BandTables:
+        if self._tables is None:
+            from hhsr.compiled import compile_tree
+
+            self._tables = compile_tree(self.tree).band_tables
+        return self._tables
 
     def _where_many_meet(self, piece: Piece, d: float) -> IntArray:
         """Return which vertices on the slab's planes have three sources or more: the union made them."""
