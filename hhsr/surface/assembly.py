@@ -6,20 +6,23 @@ from collections.abc import Sequence
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from hhsr.check import as_float
-from hhsr.model import Cut, FloatArray, IntArray, ModelLeaf, Node, RetainedPart, Tree, cuts, leaves, rotation_matrix
+from hhsr.model import Cut, FloatArray, IntArray, Node, RetainedPart, Tree, cuts, leaves, rotation_matrix
 from hhsr.surface.blend import outline, slab_body
 from hhsr.surface.piece import Bodies, Piece
 from hhsr.surface.polish import polish
 from hhsr.surface.sample import Halfspace, tessellate
 from hhsr.surface.sources import Patch, Retained, Source, Step, Strip
+from hhsr.surface.tidy import tidy
 
 # Vertices are on the surface and facets are chords, so all misses point inwards: a share of what was asked keeps the
 # mean far below it (measured: mean radial miss 0.39 of the edge tolerance).
 EDGE_SHARE = 0.4
 FURTHEST = 10.0  # tolerances that a vertex may be moved when it is put back onto the exact surfaces
 SHORTEST = 0.01  # tolerances: shorter edges are collapsed at the end
+STORABLE = 2e-4  # mm: ends of shorter edges might become one vertex in a file of 32-bit floats
 
 
 # For each cut, in the order of `hhsr.model.cuts`, and each of its lobes: (256,) mm radii at h = −d and at h = +d.
@@ -45,8 +48,7 @@ def reconstruct(tree: Tree, tolerance_mm: float = 0.02, band_tables: BandTables 
     tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-4, 100.0)
     assembly = _Assembly(tree, tolerance, band_tables)
     piece = assembly.node(tree.root, [])
-    if len(piece.faces):
-        piece = assembly.bodies.simplified(piece, SHORTEST * tolerance)
+    piece = tidy(piece, max(SHORTEST * tolerance, STORABLE))
     rotation, translation = rotation_matrix(tree.pose[:3]), tree.pose[3:]
     inner = leaf_inside(tree.root, piece)
     mesh = trimesh.Trimesh(
@@ -123,13 +125,13 @@ class _Assembly:
             self._tables = compile_tree(self.tree).band_tables
         return self._tables
 
-    def _where_many_meet(self, piece: Piece, d: float) -> IntArray:
+    def _where_many_meet(self, piece: Piece, d: float) -> NDArray[np.bool_]:
         """Return which vertices on the slab's planes have three sources or more: the union made them."""
         pairs = np.unique(np.stack([piece.faces.ravel(), np.repeat(piece.source, 3)], axis=1), axis=0)
         count = np.bincount(pairs[:, 0], minlength=len(piece.vertices)) if len(pairs) else np.zeros(0)
-        return (count >= 3) & (np.abs(piece.vertices[:, 2]) == d)
+        return np.asarray((count >= 3) & (np.abs(piece.vertices[:, 2]) == d))
 
-    def _polished(self, cut: Cut, piece: Piece, chosen: IntArray) -> Piece:
+    def _polished(self, cut: Cut, piece: Piece, chosen: NDArray[np.bool_]) -> Piece:
         """Return the piece (cut's frame) with the chosen vertices on their surfaces; none leaves the cut's planes."""
         if not chosen.any():
             return piece

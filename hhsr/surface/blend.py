@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from hhsr.model import FloatArray, IntArray
@@ -17,8 +19,8 @@ def slab_body(
 ) -> Piece:
     """Return a lobe's body in the cut's frame, closed; its ends lie at z = ∓d exactly.
 
-    below, above: (k, 2, 2) mm, edges of the children's outlines on the two planes; where they follow the band's end, the
-    body takes them over, so that nothing is left between. steps: the sources of the end faces.
+    below, above: (k, 2, 2) mm, edges of the children's outlines on the two planes; where they follow the band's end,
+    the body takes them over, so that nothing is left between. steps: the sources of the end faces.
     """
     d, centre = strip.model.half_width, strip.model.contours[strip.lobe].centre
     count = _angles_needed(strip, tolerance_mm)
@@ -36,7 +38,7 @@ def slab_body(
     vertices = np.concatenate([*rings, [[*centre, -d], [*centre, d]]])
     sides = [
         _between(_angle(a - [*centre, 0.0]), _angle(b - [*centre, 0.0]), starts[i], starts[i + 1])
-        for i, (a, b) in enumerate(zip(rings[:-1], rings[1:], strict=True))
+        for i, (a, b) in enumerate(pairwise(rings))
     ]
     low, high = starts[0] + np.arange(len(rings[0])), starts[-2] + np.arange(len(rings[-1]))
     bottom = np.stack([np.full(len(low), len(vertices) - 2), np.roll(low, -1), low], axis=1)
@@ -65,7 +67,7 @@ def outline(piece: Piece, height: float, up: bool) -> FloatArray:
 
 
 def _polar(radius: FloatArray, angles: FloatArray) -> FloatArray:
-    return np.stack([radius * np.cos(angles), radius * np.sin(angles)], axis=1)
+    return np.asarray(np.stack([radius * np.cos(angles), radius * np.sin(angles)], axis=1))
 
 
 def _angle(points: FloatArray) -> FloatArray:
@@ -99,7 +101,7 @@ def _rows_needed(strip: Strip, angles: FloatArray, tolerance_mm: float) -> int:
 
 
 def _end_ring(strip: Strip, share: float, edges: FloatArray, angles: FloatArray) -> FloatArray:
-    """Return (k, 3) a band's end about its centre: the child's outline where it fits, the band's own radii elsewhere."""
+    """Return (k, 3) a band's end about its centre: the child's outline where it fits, else the band's own radii."""
     centre = strip.model.contours[strip.lobe].centre
     local = edges - centre
     radius, angle = np.linalg.norm(local, axis=2), np.arctan2(local[:, :, 1], local[:, :, 0])

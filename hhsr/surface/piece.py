@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import manifold3d
 import numpy as np
-from numpy.typing import NDArray
 
 from hhsr.errors import SurfaceError
 from hhsr.model import FloatArray, IntArray
@@ -93,14 +92,3 @@ class Bodies:
             return some[0] if some else Piece.empty()
         bodies = [self.body(p) for p in some]
         return self.piece(manifold3d.Manifold.batch_boolean(bodies, manifold3d.OpType.Add))
-
-    def simplified(self, piece: Piece, tolerance_mm: float) -> Piece:
-        """Return the piece without edges shorter than the tolerance; vertices that stay do not move."""
-        return self.piece(self.body(piece).simplify(tolerance_mm)) if len(piece.faces) else piece
-
-
-def boolean_mask(count: int, index: IntArray) -> NDArray[np.bool_]:
-    """Return (count,) True at the given indices."""
-    mask = np.zeros(count, dtype=bool)
-    mask[index] = True
-    return mask

@@ -58,7 +58,7 @@ def tessellate(leaf: ModelLeaf, region: list[Halfspace], tolerance_mm: float) ->
 
 def _on_surface(directions: FloatArray, arrays: LeafArrays) -> FloatArray:
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    return unit * leaf_radii(np.ascontiguousarray(unit), *arrays)[:, None]
+    return np.asarray(unit * leaf_radii(np.ascontiguousarray(unit), *arrays)[:, None])
 
 
 def _edges_to_split(
