@@ -11,6 +11,9 @@ from hhsr.fitting.mutex import MutexPairs
 from hhsr.model import FloatArray
 
 
+LEAST_SHARE = 0.01
+
+
 class Plane(NamedTuple):
     """normal: (3,) unit. offset: mm; the signed height of p is n·p − offset, ≥ 0 on the right."""
 
@@ -41,41 +44,38 @@ def utilities(pairs: MutexPairs, normals: FloatArray, offsets: FloatArray) -> tu
     The factor (1 − min/max) is 1 where both sides are free of pairs; a pair counts |n·(X − Y)| / |X − Y|, as it has no
     direction.
     """
-    right = np.einsum("ki,jei->kje", normals, pairs.points) >= offsets[:, None, None]
-    cut = right[:, :, 0] != right[:, :, 1]
-    on_right = (right[:, :, 0] & right[:, :, 1]).sum(axis=1)
-    on_left = (~right[:, :, 0] & ~right[:, :, 1]).sum(axis=1)
+    first = pairs.points[:, 0] @ normals.T >= offsets
+    second = pairs.points[:, 1] @ normals.T >= offsets
+    cut = first != second
+    on_right, on_left = (first & second).sum(axis=0), (~first & ~second).sum(axis=0)
     more, less = np.maximum(on_left, on_right), np.minimum(on_left, on_right)
     balance = 1.0 - np.divide(less, more, out=np.zeros(less.size), where=more > 0)
     difference = pairs.points[:, 0] - pairs.points[:, 1]
-    along = np.abs(normals @ (difference / np.sqrt((difference**2).sum(axis=1))[:, None]).T)
-    gain = (np.where(cut, along, 0.0) * pairs.weights).sum(axis=1)
-    return balance * gain, cut.sum(axis=1)
+    unit = difference / np.sqrt((difference**2).sum(axis=1))[:, None]
+    gain = np.einsum("jk,jk,j->k", np.abs(unit @ normals.T), cut.astype(np.float64), pairs.weights)
+    return balance * gain, cut.sum(axis=0)
 
 
-def best_plane(pairs: MutexPairs, points: FloatArray) -> Plane | None:
-    """Return the plane with the most utility; ties by pairs cut, then by balance of area, then by index.
+def ranked_planes(pairs: MutexPairs, points: FloatArray, most: int = 1) -> list[Plane]:
+    """Return up to `most` planes, best utility first; ties by pairs cut, then by balance of area, then by index.
 
     Parameters
     ----------
     pairs : mutex pairs of the part.
     points : (n, 3) points spread over the part's surface by area.
 
-    None where no plane cuts a pair and leaves surface on both sides (≥ 1 % of the points).
+    Empty where no plane cuts a pair and leaves surface on both sides (≥ 1 % of the points).
     """
-    if pairs.weights.size == 0:
-        return None
+    if pairs.weights.size == 0 or points.shape[0] == 0:
+        return []
     normals, offsets = candidate_planes(pairs)
     utility, cut = utilities(pairs, normals, offsets)
     share = np.empty(offsets.size)
     for k in range(0, offsets.size, 256):
         share[k : k + 256] = (points @ normals[k : k + 256].T >= offsets[k : k + 256]).mean(axis=0)
     smaller = np.minimum(share, 1.0 - share)
-    taken = (cut > 0) & (smaller >= 0.01)
-    if not taken.any():
-        return None
+    taken = (cut > 0) & (smaller >= LEAST_SHARE)
     # To twelve digits, so that rounding does not decide a tie.
     rounded = np.round(utility / max(float(utility.max()), 1e-300), 12)
     order = np.lexsort((np.arange(offsets.size), -smaller, -cut, -rounded, ~taken))
-    best = int(order[0])
-    return Plane(normals[best], float(offsets[best]))
+    return [Plane(normals[k], float(offsets[k])) for k in order[: min(most, int(taken.sum()))]]

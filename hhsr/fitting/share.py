@@ -1,0 +1,120 @@
+"""One budget over all leaves: uniform centres go where the next of them saves most (DESIGN §3)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from hhsr.errors import FitError
+from hhsr.fitting.options import FitOptions
+from hhsr.fitting.source import Source
+from hhsr.fitting.split import Part
+from hhsr.fitting.uniform_field import LADDER, FieldFit, LeafRows, fit_field, leaf_rows
+from hhsr.model import ModelLeaf
+
+LEAST_FALL = 0.05
+ROWS_PER_CENTRE = 8
+FILLING_STEPS = 7
+
+
+class Claim(NamedTuple):
+    """A leaf that wants centres: its key, its superquadric, its part."""
+
+    key: int
+    leaf: ModelLeaf
+    part: Part
+
+
+class _Ladder:
+    """Fits of one leaf with ever more centres; each is made when it is asked for."""
+
+    def __init__(self, claim: Claim, source: Source) -> None:
+        self.claim = claim
+        self._source = source
+        self._rows: dict[int, LeafRows] = {}
+        self._fits: dict[int, FieldFit] = {}
+
+    def fit(self, count: int) -> FieldFit:
+        """Return the fit with `count` uniform centres on the sphere (those without data left out)."""
+        if count not in self._fits:
+            most = 4000 if ROWS_PER_CENTRE * count <= 4000 else 12_000
+            if most not in self._rows:
+                leaf = self.claim.leaf
+                self._rows[most] = leaf_rows(self.claim.part, self._source, leaf.centre, leaf.rotation, most)
+            self._fits[count] = fit_field(self.claim.leaf, self._rows[most], count)
+        return self._fits[count]
+
+
+def shared_out(claims: list[Claim], source: Source, options: FitOptions, fixed: int) -> dict[int, FieldFit]:
+    """Return the fit of each claim.
+
+    With a budget: the step up some leaf's ladder that saves most mm³ per number is taken while it fits; what is left
+    then makes all counts grow alike. Without one: each leaf climbs while a step lowers its error by 5 %, or until
+    max_mean_error_mm is met.
+
+    Raises
+    ------
+    FitError : not even the bare superquadrics go into the budget.
+    """
+    ladders = [_Ladder(claim, source) for claim in claims]
+    if options.max_parameters is None:
+        return {ladder.claim.key: ladder.fit(_climbed(ladder, options.max_mean_error_mm)) for ladder in ladders}
+    room = options.max_parameters - fixed - sum(ladder.fit(0).leaf.parameters for ladder in ladders)
+    if room < 0:
+        raise FitError(
+            f"cuts and superquadrics take {options.max_parameters - room} numbers, max_parameters is "
+            f"{options.max_parameters}; allow more, or cut less (a larger t1)"
+        )
+    counts = _bought(ladders, room)
+    counts = _filled(ladders, counts, room)
+    return {ladder.claim.key: ladder.fit(count) for ladder, count in zip(ladders, counts, strict=True)}
+
+
+def _climbed(ladder: _Ladder, goal_mm: float | None) -> int:
+    """Return the count at which further centres no longer pay, or the goal is met."""
+    count = 0
+    for step in LADDER:
+        now, then = ladder.fit(count), ladder.fit(step)
+        if goal_mm is not None:
+            if now.mean_mm <= 0.8 * goal_mm:
+                break
+        elif count >= 32 and then.mean_mm > (1.0 - LEAST_FALL) * now.mean_mm:
+            break
+        count = step
+    return count
+
+
+def _bought(ladders: list[_Ladder], room: int) -> list[int]:
+    """Return a count per ladder by steps of most saving per number."""
+    counts = [0] * len(ladders)
+    while True:
+        best: tuple[float, int, int, int] | None = None
+        for i, ladder in enumerate(ladders):
+            now = ladder.fit(counts[i])
+            # Two steps ahead: a small step that saves nothing must not hide a larger one that does.
+            for step in [s for s in LADDER if s > counts[i]][:2]:
+                if step > 4 * (room + 8):
+                    break
+                then = ladder.fit(step)
+                cost = then.leaf.parameters - now.leaf.parameters
+                saving = (now.area_error - then.area_error) / max(cost, 1)
+                if cost <= room and saving > 0.0 and (best is None or saving > best[0]):
+                    best = saving, i, step, cost
+        if best is None:
+            return counts
+        _, i, counts[i], cost = best
+        room -= cost
+
+
+def _filled(ladders: list[_Ladder], counts: list[int], room: int) -> list[int]:
+    """Return the counts, all grown by the largest common factor that goes into the room."""
+    base = sum(ladder.fit(0).leaf.parameters for ladder in ladders)
+    best, low, high = counts, 1.0, 1.6
+    for _ in range(FILLING_STEPS):
+        factor = 0.5 * (low + high)
+        grown = [int(c * factor) for c in counts]
+        used = sum(ladder.fit(c).leaf.parameters for ladder, c in zip(ladders, grown, strict=True)) - base
+        if used <= room:
+            best, low = grown, factor
+        else:
+            high = factor
+    return best
