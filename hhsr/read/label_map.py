@@ -61,7 +61,7 @@ def surface_of_labels(
         warnings = (
             "the label touches the image's border, where the surface was closed: the organ may go on beyond it",
         )
-    index, faces = surface_of_mask(mask, spacing)
+    index, faces = surface_of_mask(mask)
     if np.linalg.det(affine[:3, :3]) < 0:
         faces = np.ascontiguousarray(faces[:, ::-1])
     return index @ affine[:3, :3].T + affine[:3, 3], faces, chosen, warnings
