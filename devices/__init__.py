@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from devices.clock import Clock, ManualClock, SystemClock
     from devices.errors import DeviceError, DeviceInputError, ProtocolError, TrackerError, TransportError
     from devices.frame import ToolPose, ToolStatus, TrackerFrame
+    from devices.ndi.tracker import NdiTracker
     from devices.recording import Recorder, ReplayTracker
     from devices.registry import open_tracker
     from devices.simulated import SimulatedTracker
@@ -27,6 +28,7 @@ _HOMES = {
     "clock": ("Clock", "ManualClock", "SystemClock"),
     "errors": ("DeviceError", "DeviceInputError", "ProtocolError", "TrackerError", "TransportError"),
     "frame": ("ToolPose", "ToolStatus", "TrackerFrame"),
+    "ndi.tracker": ("NdiTracker",),
     "recording": ("Recorder", "ReplayTracker"),
     "registry": ("open_tracker",),
     "simulated": ("SimulatedTracker",),
@@ -40,6 +42,7 @@ __all__ = [
     "DeviceError",
     "DeviceInputError",
     "ManualClock",
+    "NdiTracker",
     "ProtocolError",
     "Recorder",
     "ReplayTracker",

@@ -119,7 +119,17 @@ def _open_replay(url: str, place: str, parameters: Parameters, clock: Clock | No
     return ReplayTracker(place, clock=clock, **values)
 
 
+def _open_ndi(url: str, place: str, parameters: Parameters, clock: Clock | None) -> Tracker:
+    from devices.ndi.tracker import NdiTracker
+
+    roms, names = parameters.pop("rom", []), parameters.pop("name", [])
+    readers: dict[str, Callable[[str], Any]] = {"baud_rate": int, "mode": str, "latency_s": float}
+    readers |= {"wired": _flag, "markers": _flag, "strays": _flag, "reply_timeout_s": float}
+    return NdiTracker(place, roms=roms, names=names, clock=clock, **_taken(url, parameters, readers))
+
+
 _OPENERS: dict[str, Callable[[str, str, Parameters, Clock | None], Tracker]] = {
     "sim": _open_sim,
     "replay": _open_replay,
+    "ndi": _open_ndi,
 }

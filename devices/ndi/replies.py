@@ -108,11 +108,6 @@ class PoseReport:
     device_time_s: float | None = None
     alerts: tuple[tuple[int, int], ...] = ()
 
-    @property
-    def frame(self) -> int | None:
-        """Newest frame number of any handle."""
-        return max((report.frame for report in self.handles if report.frame is not None), default=None)
-
 
 def tool_pose(report: HandleReport, markers: bool = False) -> ToolPose:
     """Turn one handle's report into a `ToolPose`: OK only where the device states no reservation at all.

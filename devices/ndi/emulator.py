@@ -1,0 +1,292 @@
+"""An emulated NDI tracker on a pseudo-terminal or a TCP port, for clients that cannot tell."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import pty
+import select
+import socket
+import struct
+import termios
+import threading
+import tty
+from abc import ABC, abstractmethod
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from devices.errors import DeviceInputError, TransportError
+from devices.ndi.device import Device
+from devices.ndi.faults import Faults
+
+__all__ = ["Emulator", "PtyEmulator", "TcpEmulator"]
+
+_POLL_S = 0.05
+_TRACKING = (b"TX", b"BX")
+#: a device that lost its cable is back after this, s
+_PLUG_S = 0.3
+
+
+class Disconnected(Exception):
+    """The client has gone, or a fault cut the line."""
+
+
+class Emulator(ABC):
+    """Serve a `Device` on a line, on a thread of its own, until `stop`.
+
+    Parameters
+    ----------
+    device : Device or None
+    faults : Faults or None
+    """
+
+    def __init__(self, device: Device | None = None, faults: Faults | None = None) -> None:
+        self.device = Device() if device is None else device
+        self.faults = Faults() if faults is None else faults
+        if self.faults.wrap:
+            self.device.first_frame = 2**32 - 120
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    @abstractmethod
+    def url(self) -> str:
+        """What `open_tracker` takes to reach it."""
+
+    @abstractmethod
+    def _listen(self) -> None:
+        """Open the line."""
+
+    @abstractmethod
+    def _serve(self) -> None:
+        """Answer one client until it has gone; return now and then where there is none."""
+
+    @abstractmethod
+    def _hang_up(self) -> None:
+        """Cut the line, and have it ready again a little later."""
+
+    @abstractmethod
+    def _close(self) -> None:
+        """Close everything."""
+
+    def start(self) -> Self:
+        """Listen, and serve from a thread; returns once clients can connect."""
+        if self._thread is None:
+            self._stopping.clear()
+            self._listen()
+            self._thread = threading.Thread(target=self._run, name=f"emulator on {self.url}", daemon=True)
+            self._thread.start()
+        return self
+
+    def stop(self) -> None:
+        """Stop serving and close the line."""
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join(5.0)
+            self._thread = None
+            self._close()
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                self._serve()
+            except Disconnected:
+                self._hang_up()
+
+    def _answer(self, data: bytes, write_line: int | socket.socket) -> None:
+        """Answer what came in, with whatever the faults make of it."""
+        for message, reply in self._replies(data):
+            due = False
+            if message.startswith(_TRACKING) and self.device.tracking:
+                due = self.faults.moment()
+                if due and self.faults.out_of_volume:
+                    self.device.out_of_volume ^= {0}
+            for delivery in self.faults.deliver(reply, due):
+                if delivery.delay_s > 0.0:
+                    self._stopping.wait(delivery.delay_s)
+                if delivery.disconnect:
+                    raise Disconnected
+                self._write(write_line, delivery.data)
+
+    def _replies(self, data: bytes) -> list[tuple[bytes, bytes]]:
+        *whole, rest = (self._partial + data).split(b"\r")
+        self._partial = rest
+        return [(message.lstrip(b"\n"), reply) for message in whole for reply in self.device.receive(message + b"\r")]
+
+    _partial = b""
+
+    def _write(self, line: int | socket.socket, data: bytes) -> None:
+        view = memoryview(data)
+        while view and not self._stopping.is_set():
+            if not select.select([], [line], [], _POLL_S)[1]:
+                continue
+            try:
+                sent = os.write(line, view) if isinstance(line, int) else line.send(view)
+            except OSError:
+                raise Disconnected from None
+            view = view[sent:]
+
+
+class PtyEmulator(Emulator):
+    """An emulator on a pseudo-terminal: `path` opens like a serial port.
+
+    A serial break cannot be seen here. But clients that reset by a break flush the line first, both ways, and wait: a
+    double flush that no command follows within 150 ms is answered as a break would be.
+
+    Parameters
+    ----------
+    link : str, Path or None
+        A symbolic link that always points to the terminal, also after a disconnection gave it another name.
+    """
+
+    _BREAK_S = 0.15
+
+    def __init__(
+        self, device: Device | None = None, faults: Faults | None = None, link: str | Path | None = None
+    ) -> None:
+        super().__init__(device, faults)
+        self.link = None if link is None else Path(link)
+        self._master = self._slave = -1
+        self._terminal = ""
+        self._flushed_s: float | None = None
+
+    @property
+    def path(self) -> str:
+        """What a client opens: the link where there is one."""
+        return self._terminal if self.link is None else str(self.link)
+
+    @property
+    def url(self) -> str:
+        """What `open_tracker` takes to reach it."""
+        return f"ndi:{self.path}"
+
+    def _listen(self) -> None:
+        self._master, self._slave = pty.openpty()
+        # raw, or the terminal would echo; the slave stays open here, or reads fail whenever no client has it open
+        tty.setraw(self._slave)
+        fcntl.ioctl(self._master, termios.TIOCPKT, struct.pack("i", 1))
+        self._terminal = os.ttyname(self._slave)
+        if self.link is not None:
+            try:
+                if self.link.is_symlink():
+                    self.link.unlink()
+                self.link.symlink_to(self._terminal)
+            except OSError as error:
+                raise DeviceInputError(f"{self.link}: cannot be made a link to {self._terminal}: {error}") from error
+
+    def _serve(self) -> None:
+        ready = select.select([self._master], [], [], _POLL_S)[0]
+        now_s = self.device.clock.now_s()
+        if not ready:
+            if self._flushed_s is not None and now_s - self._flushed_s >= self._BREAK_S:
+                self._flushed_s = None
+                self.device.reset()
+                self._partial = b""
+                self._answer(b"RESET\r", self._master)
+            return
+        try:
+            packet = os.read(self._master, 4096)
+        except OSError as error:
+            if error.errno == errno.EIO:
+                self._stopping.wait(_POLL_S)
+                return
+            raise
+        kind = packet[0]
+        if kind == termios.TIOCPKT_DATA:
+            self._flushed_s = None
+            self._answer(packet[1:], self._master)
+        elif kind & termios.TIOCPKT_FLUSHREAD and kind & termios.TIOCPKT_FLUSHWRITE:
+            self._flushed_s = now_s
+
+    def _hang_up(self) -> None:
+        self._close()
+        self.device.reset()
+        self._partial = b""
+        self._stopping.wait(_PLUG_S)
+        if not self._stopping.is_set():
+            self._listen()
+
+    def _close(self) -> None:
+        if self.link is not None and self.link.is_symlink():
+            self.link.unlink()
+        for descriptor in (self._master, self._slave):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._master = self._slave = -1
+
+
+class TcpEmulator(Emulator):
+    """An emulator on a TCP port; one client at a time, a new one takes the place of the old.
+
+    Parameters
+    ----------
+    port : int
+        0 takes a free one.
+    host : str
+    """
+
+    def __init__(
+        self, device: Device | None = None, faults: Faults | None = None, port: int = 0, host: str = "127.0.0.1"
+    ) -> None:
+        super().__init__(device, faults)
+        self.host, self.port = host, port
+        self._listener: socket.socket | None = None
+        self._client: socket.socket | None = None
+
+    @property
+    def url(self) -> str:
+        """What `open_tracker` takes to reach it."""
+        return f"ndi:tcp://{self.host}:{self.port}"
+
+    def _listen(self) -> None:
+        try:
+            self._listener = socket.create_server((self.host, self.port))
+        except (OSError, OverflowError) as error:
+            raise TransportError(f"cannot listen on {self.host}:{self.port}: {error}") from error
+        self.port = self._listener.getsockname()[1]
+
+    def _serve(self) -> None:
+        listener, client = self._listener, self._client
+        assert listener is not None
+        waiting = [listener] if client is None else [listener, client]
+        for ready in select.select(waiting, [], [], _POLL_S)[0]:
+            if ready is listener:
+                self._drop()
+                self._client, _ = listener.accept()
+                self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._client.setblocking(False)
+                return
+            try:
+                data = ready.recv(4096)
+            except OSError:
+                data = b""
+            if not data:
+                self._drop()
+                return
+            self._answer(data, ready)
+
+    def _drop(self) -> None:
+        self._partial = b""
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+
+    def _hang_up(self) -> None:
+        self._drop()
+        self.device.reset()
+
+    def _close(self) -> None:
+        self._drop()
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
