@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -191,8 +190,8 @@ def _template(table: Table, target: Target) -> Array:
 def _errors(table: Table) -> ErrorBudget:
     _check_keys(table, "errors")
     fit = _text(table, "fit", "errors")
-    budget = replace(ErrorBudget(), **_numbers({k: v for k, v in table.items() if k != "fit"}, "errors"))
-    return budget if fit is None else replace(budget, fit=fit)
+    given: dict[str, Any] = dict(_numbers({k: v for k, v in table.items() if k != "fit"}, "errors"))
+    return ErrorBudget(**given) if fit is None else ErrorBudget(**given, fit=fit)
 
 
 def _check_keys(table: Table, where: str) -> None:

@@ -83,12 +83,12 @@ class Rod:
 
     def _crossing_list(self, a, b):
         """Sign changes by fine steps and bisection: slow, plain, good to 1e-9 of the segment."""
-        t = np.linspace(0.0, 1.0, 4001)
+        t = np.linspace(0.0, 1.0, 401)
         f = self.signed_distance(a + t[:, None] * (b - a))
         roots = []
         for k in np.flatnonzero((f[:-1] > 0) != (f[1:] > 0)):
             lo, hi, outside = t[k], t[k + 1], f[k] > 0
-            for _ in range(40):
+            for _ in range(30):
                 mid = 0.5 * (lo + hi)
                 lo, hi = (mid, hi) if (self.signed_distance(a + mid * (b - a)) > 0) == outside else (lo, mid)
             roots.append((0.5 * (lo + hi), bool(outside)))
