@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from guidance.errors import SceneError
 from guidance.needle import Array
@@ -60,14 +61,52 @@ class ErrorBudget:
 
 
 def fit_errors_mm(shape: Shape, points: Array, statistic: str) -> Array:
-    """The fit error (...,), mm, that rules at points (..., 3): that of the leaf which the shape has nearest there.
+    """The fit error (n,), mm, of the leaf in whose region each of the surface points (n, 3) lies.
 
     A far spike of the fit therefore does not widen the margin everywhere.
+
+    Raises
+    ------
+    SceneError
+        If the shape does not say how well it fits.
     """
-    return np.asarray(shape.fit_error_at(points)[..., FIT_STATISTICS.index(statistic)])
+    errors = _errors_by_leaf(shape, statistic)
+    if len(errors) == 1:
+        return np.full(len(points), errors[0])
+    return np.asarray(np.array(errors)[_leaf_at(shape, points)])
 
 
 def fit_error_range_mm(shape: Shape, statistic: str) -> tuple[float, float]:
     """The least and the largest (mm) that `fit_errors_mm` can give: what a quick bound may assume."""
-    errors = [figures[FIT_STATISTICS.index(statistic)] for figures in (*shape.leaf_errors, shape.fit_error)]
+    errors = _errors_by_leaf(shape, statistic)
     return min(errors), max(errors)
+
+
+def _errors_by_leaf(shape: Shape, statistic: str) -> list[float]:
+    """Per leaf, left to right; one entry where the shape states only the error of the whole."""
+    column = FIT_STATISTICS.index(statistic)
+    if shape.leaf_errors:
+        return [figures[column] for figures in shape.leaf_errors]
+    if shape.fit_error is None:
+        raise SceneError("a shape does not say how well it fits its source: fit it with hhsr, which measures that")
+    return [shape.fit_error[column]]
+
+
+def _leaf_at(shape: Shape, points: Array) -> NDArray[np.intp]:
+    """The leaf, counted left to right, in whose region each point (n, 3) lies: descend by the sides of the planes."""
+    from hhsr.model import Cut, Node, leaves, rotation_matrix
+
+    pose = shape.tree.pose
+    local = (points - pose[3:]) @ rotation_matrix(pose[:3])
+    found = np.zeros(len(points), dtype=np.intp)
+
+    def descend(node: Node, which: NDArray[np.intp], first: int) -> None:
+        if not isinstance(node, Cut):
+            found[which] = first
+            return
+        right = local[which] @ node.normal - node.offset >= 0.0
+        descend(node.left, which[~right], first)
+        descend(node.right, which[right], first + sum(1 for _ in leaves(node.left)))
+
+    descend(shape.tree.root, np.arange(len(points)), 0)
+    return found

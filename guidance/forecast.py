@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 _TOUCH_MM = 0.02  # a gap this small is contact: twice the tolerance of the shape's clearance
 _STEPS = 60
-_SAMPLES = np.linspace(0.0, 1.0, 17)
 
 
 def forecast_contact(shape: Shape, needle: Needle, motion: Motion, limits: Limits, age_s: float) -> Forecast:
@@ -49,16 +48,13 @@ def forecast_contact(shape: Shape, needle: Needle, motion: Motion, limits: Limit
     sideways = needle.length_mm * float(np.linalg.norm(motion.direction.rate))
     speed = motion.speed_mm_s + sideways
     grid = np.linspace(0.0, horizon, 17)
-    lever = 0.0
-    growth = _growth(motion, limits, grid, lever)
+    growth = _growth(motion, limits, grid, 0.0)
     start = float(shape.clearance(*_one(motion, 0.0, needle), needle.radius_mm))
     if start > speed * horizon + growth.max() + _TOUCH_MM:
         return Forecast()
     nominal = _walk(shape, needle, motion, horizon, speed, np.zeros(len(grid)), grid, start)
     at = min(nominal, horizon)
-    hub, tip = _one(motion, at, needle)
-    nearest = shape.signed_distance(tip + _SAMPLES[:, None] * (hub - tip))
-    lever = float(_SAMPLES[int(np.argmin(nearest))]) * needle.length_mm
+    lever = (1.0 - float(shape.closest_approach(*_one(motion, at, needle)).t)) * needle.length_mm
     growth = _growth(motion, limits, grid, lever)
     earliest = _walk(shape, needle, motion, horizon, speed, growth, grid, start)
     latest = _walk(shape, needle, motion, horizon, speed, -growth, grid, start) if nominal < inf else inf

@@ -17,7 +17,6 @@ from guidance.forecast import forecast_contact
 from guidance.limits import Limits
 from guidance.motion import Motion, MotionFilter
 from guidance.needle import Array
-from guidance.planning.constraints import nearest_on_axis
 from guidance.planning.plans import Plan
 from guidance.pose_gate import PoseGate
 from guidance.rigid import check_rigid
@@ -157,8 +156,8 @@ class Monitor:
         statistic = self.scene.errors.fit
         fit_error = fit_error_range_mm(s.shape, statistic)[1]
         if 0.0 < distance <= fixed + fit_error + self.limits.hysteresis_mm:
-            nearest, _ = nearest_on_axis(s.shape, hub[None], tip[None])
-            fit_error = float(fit_errors_mm(s.shape, nearest, statistic)[0])
+            nearest = s.shape.closest_approach(hub, tip).on_surface
+            fit_error = float(fit_errors_mm(s.shape, nearest[None], statistic)[0])
         return fixed + fit_error, fit_error
 
     def _judge(

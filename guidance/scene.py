@@ -192,4 +192,4 @@ class Scene:
 
 def shape_hash(shape: Shape) -> str:
     """First 16 hex digits of the SHA-256 of a shape's stored form."""
-    return hashlib.sha256(shape.encoded()).hexdigest()[:16]
+    return hashlib.sha256(shape.encoded).hexdigest()[:16]

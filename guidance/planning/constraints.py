@@ -136,11 +136,10 @@ def _clearances(scene: Scene, structure: Structure, candidates: Candidates, whic
     keep = bound >= fixed + least
     index, hubs, tips = index[keep], hubs[keep], tips[keep]
     if len(index):
-        measured[index] = shape.clearance(hubs, tips, needle.radius_mm)
-        exact[index] = True
-        nearest, along = nearest_on_axis(shape, hubs, tips)
-        fit_error[index] = fit_errors_mm(shape, nearest, scene.errors.fit)
-        depth[index] = along - needle.length_mm + candidates.depths[index]
+        near = shape.closest_approach(hubs, tips, needle.radius_mm)
+        measured[index], exact[index] = near.clearance, True
+        fit_error[index] = fit_errors_mm(shape, near.on_surface, scene.errors.fit)
+        depth[index] = (near.t - 1.0) * needle.length_mm + candidates.depths[index]
     return Clearances(measured, fixed + fit_error, fit_error, depth, exact)
 
 
@@ -160,14 +159,3 @@ def _upper_bound(shape: Shape, hubs: Array, tips: Array, needed: float, needle: 
         nearest = shape.signed_distance(points).min(axis=1) - needle.radius_mm
         bound[open_] = np.minimum(bound[open_], nearest)
     return bound
-
-
-def nearest_on_axis(shape: Shape, hubs: Array, tips: Array, samples: int = 33) -> tuple[Array, Array]:
-    """Where on each axis the shape is nearest, by samples: points (n, 3) and lengths from the hub (n,), mm.
-
-    Only used to say *where*; how near is answered by the shape's certified `clearance`.
-    """
-    shares = np.linspace(0.0, 1.0, samples)
-    points = hubs[:, None] + shares[:, None] * (tips - hubs)[:, None]
-    best = shape.signed_distance(points).argmin(axis=1)
-    return points[np.arange(len(hubs)), best], shares[best] * np.linalg.norm(tips - hubs, axis=1)

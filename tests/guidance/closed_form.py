@@ -16,6 +16,14 @@ class Crossings:
     entering: np.ndarray
 
 
+@dataclass(frozen=True)
+class Clearance:
+    clearance: np.ndarray
+    t: np.ndarray
+    on_axis: np.ndarray
+    on_surface: np.ndarray
+
+
 def segment_distance(a, b, c, d):
     """Least distance of the segments ab (..., 3) and cd (3,): ends against the other, and the interior optimum."""
     a, b = np.atleast_2d(a), np.atleast_2d(b)
@@ -81,6 +89,15 @@ class Rod:
         gap = segment_distance(starts.reshape(-1, 3), ends.reshape(-1, 3), self.start, self.end)
         return (gap - self.radius - radius).reshape(starts.shape[:-1])
 
+    def closest_approach(self, starts, ends, radius=0.0):
+        """Clearance in closed form; where, by fine samples of the axis."""
+        starts, ends = np.asarray(starts, float), np.asarray(ends, float)
+        t = np.linspace(0.0, 1.0, 301)
+        axis = starts[..., None, :] + t[:, None] * (ends - starts)[..., None, :]
+        best = t[self.signed_distance(axis).argmin(axis=-1)]
+        on_axis = starts + best[..., None] * (ends - starts)
+        return Clearance(self.clearance(starts, ends, radius), best, on_axis, self.closest_point(on_axis)[0])
+
     def _crossing_list(self, a, b):
         """Sign changes by fine steps and bisection: slow, plain, good to 1e-9 of the segment."""
         t = np.linspace(0.0, 1.0, 401)
@@ -127,6 +144,7 @@ class Rod:
     def leaf_errors(self):
         return (self.fit_error,)
 
+    @property
     def encoded(self):
         return f"{self.start}{self.end}{self.radius}{self.fit_error}".encode()
 
