@@ -12,6 +12,7 @@ from hhsr.fitting.cuts import Plane, ranked_planes
 from hhsr.fitting.mutex import MutexPairs, mutex_pairs
 from hhsr.fitting.options import FitOptions
 from hhsr.fitting.retain import require_room, retained_part
+from hhsr.fitting.rounding import rounded_node
 from hhsr.fitting.share import Claim, shared_out
 from hhsr.fitting.source import Source
 from hhsr.fitting.split import Part
@@ -62,7 +63,8 @@ def fit_paper(source: Source, options: FitOptions) -> Node:
     reserve = band_reserve(root, source, options)
     fixed = POSE_NUMBERS + CUT_NUMBERS * root.count_cuts()
     nodes = _fitted(root, nodes, source, options, fixed + reserve)
-    tree = _assembled(root, nodes)
+    # Bands lean on the leaves as they are stored.
+    tree = rounded_node(_assembled(root, nodes), source.extent_mm)
     room = None if budget is None else budget - POSE_NUMBERS - tree.parameters
     return add_bands(tree, source, options, room)
 

@@ -1,0 +1,146 @@
+"""How well a fit fits, measured on what is stored: two-sided true distances, per leaf, per cut (DESIGN §3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import trimesh
+
+from hhsr.fitting.samples import area_samples, face_areas
+from hhsr.model import Cut, ErrorFigures, FloatArray, IntArray, ModelLeaf, Node, Tree, cuts, leaves, rotation_matrix
+from hhsr.read.quality import measure_quality
+from hhsr.surface import Step
+from hhsr.triangle_tree import TriangleTree
+
+if TYPE_CHECKING:
+    from hhsr.shape import Shape
+
+SIGNIFICANT = 5
+
+
+class Measured(NamedTuple):
+    """error: over all samples of both sides. leaf_errors: in the order of `hhsr.model.leaves`. report: JSON values."""
+
+    error: ErrorFigures
+    leaf_errors: tuple[ErrorFigures, ...]
+    report: Mapping[str, Any]
+
+
+def measure(
+    shape: Shape, source_vertices: FloatArray, source_faces: IntArray, samples: int = 20_000, seed: int = 0
+) -> Measured:
+    """Return how far a shape and its source are apart, mm, and what its cuts and its topology are like.
+
+    Area-uniform samples of the source against `shape.mesh()` and of the mesh against the source, each to its exact
+    nearest point, pooled. A sample counts for every leaf whose region holds it or its nearest point.
+
+    Parameters
+    ----------
+    shape : what was fitted, as stored.
+    source_vertices, source_faces : (n, 3) mm, LPS, and (m, 3): closed triangles.
+    samples : on each side.
+    seed : of the samples.
+
+    An empty solid is as far from its source as the source is large: every sample counts the source's extent.
+    """
+    mesh = shape.mesh()
+    tree: Tree = shape.tree
+    count = sum(1 for _ in leaves(tree.root))
+    report = {"cuts": cut_figures(tree, mesh), "topology": topology(source_vertices, source_faces, mesh)}
+    if len(mesh.faces) == 0:
+        nothing = float(np.linalg.norm(np.ptp(source_vertices, axis=0)))
+        figures = ErrorFigures(nothing, nothing, nothing)
+        return Measured(figures, (figures,) * count, report)
+    on_source = area_samples(source_vertices, source_faces, samples, seed).points
+    on_mesh = area_samples(np.asarray(mesh.vertices), np.asarray(mesh.faces), samples, seed + 1).points
+    there, foot, _ = TriangleTree(mesh.vertices, mesh.faces).closest(on_source)
+    back, root_foot, _ = TriangleTree(source_vertices, source_faces).closest(on_mesh)
+    distance = np.concatenate([there, back])
+    owner = owners(tree, np.concatenate([on_source, on_mesh]))
+    other = owners(tree, np.concatenate([foot, root_foot]))
+    whole = figures_of(distance)
+    per_leaf = tuple(figures_of(distance[(owner == i) | (other == i)]) for i in range(count))
+    return Measured(whole, per_leaf, report)
+
+
+def figures_of(distance: FloatArray) -> ErrorFigures:
+    """Return mean, 95th percentile and maximum of distances (n,) mm; 0 where a leaf has no surface at all."""
+    if distance.size == 0:
+        return ErrorFigures(0.0, 0.0, 0.0)
+    return ErrorFigures(float(distance.mean()), float(np.percentile(distance, 95.0)), float(distance.max()))
+
+
+def owners(tree: Tree, points: FloatArray) -> IntArray:
+    """Return (n,) the leaf whose region holds each of (n, 3) LPS points, a band counted to its nearer side."""
+    local = (points - tree.pose[3:]) @ rotation_matrix(tree.pose[:3])
+    out = np.zeros(points.shape[0], dtype=np.int64)
+    _descend(tree.root, local, np.arange(points.shape[0]), out, 0)
+    return out
+
+
+def _descend(node: Node, points: FloatArray, index: IntArray, out: IntArray, number: int) -> int:
+    """Write the number of the leaf for the chosen points; return the number of the next leaf."""
+    if not isinstance(node, Cut):
+        out[index] = number
+        return number + 1
+    right = points[index] @ node.normal - node.offset >= 0.0
+    number = _descend(node.left, points, index[~right], out, number)
+    return _descend(node.right, points, index[right], out, number)
+
+
+def cut_figures(tree: Tree, mesh: trimesh.Trimesh) -> list[dict[str, Any]]:
+    """Return per cut, parents first: half width d, lobes, area of its step faces, and the largest step.
+
+    The largest step is how far a point of a step face lies from the nearest surface that is none, mm (sampled).
+    """
+    rows = []
+    source = np.asarray(mesh.face_attributes["source"])
+    kinds = mesh.metadata["sources"]
+    step_of = np.array([s.cut if isinstance(s, Step) else -1 for s in kinds] or [-1])[source]
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    areas = face_areas(vertices, faces)
+    smooth = step_of < 0
+    beside = TriangleTree(vertices, faces[smooth]) if smooth.any() and not smooth.all() else None
+    for number, cut in enumerate(cuts(tree.root)):
+        own = np.flatnonzero(step_of == number)
+        largest = 0.0
+        if own.size and beside is not None:
+            largest = float(beside.closest(vertices[faces[own]].mean(axis=1))[0].max())
+        rows.append(
+            {
+                "half_width_mm": rounded(cut.half_width),
+                "lobes": len(cut.contours),
+                "step_area_mm2": rounded(float(areas[own].sum())),
+                "largest_step_mm": rounded(largest),
+            }
+        )
+    return rows
+
+
+def topology(vertices: FloatArray, faces: IntArray, mesh: trimesh.Trimesh) -> dict[str, Any]:
+    """Return bodies, genus and volume of the source and of the fit's mesh."""
+    before = measure_quality(vertices, faces)
+    fitted_faces = np.asarray(mesh.faces, dtype=np.int64)
+    if len(fitted_faces) == 0:
+        return {"bodies": [before.bodies, 0], "genus": [before.genus, 0], "volume_ml": [rounded(before.volume_ml), 0.0]}
+    after = measure_quality(np.asarray(mesh.vertices), fitted_faces)
+    return {
+        "bodies": [before.bodies, after.bodies],
+        "genus": [before.genus, after.genus],
+        "volume_ml": [rounded(before.volume_ml), rounded(after.volume_ml)],
+    }
+
+
+def leaf_figures(tree: Tree) -> list[dict[str, Any]]:
+    """Return per leaf: its kind and the numbers it takes."""
+    return [
+        {"kind": "model" if isinstance(leaf, ModelLeaf) else "retained", "parameters": leaf.parameters}
+        for leaf in leaves(tree.root)
+    ]
+
+
+def rounded(value: float) -> float:
+    """Return a figure to five significant digits: a file's header need not be longer."""
+    return float(f"{value:.{SIGNIFICANT}g}")
