@@ -53,21 +53,21 @@ class TriangleTree:
     Parameters
     ----------
     vertices : (n, 3) mm, finite
-    faces : (m, 3) indices of vertices; m ≥ 1. `contains` and the parity of `crossings` mean something where closed.
+    faces : (m, 3) indices of vertices; m may be 0. Closed, where `contains` and parity are to mean something.
 
     Raises
     ------
     InputError
-        where shapes or indices do not fit, a vertex is not finite, or there is no triangle.
+        where shapes or indices do not fit, or a vertex is not finite.
     """
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
         points = as_points(vertices, "vertices").reshape(-1, 3)
         require_finite(points, "vertices")
         triangles = np.ascontiguousarray(faces, dtype=np.int64)
-        if triangles.ndim != 2 or triangles.shape[1] != 3 or len(triangles) == 0:
-            raise InputError(f"faces: got shape {triangles.shape}, expected (m, 3) with m ≥ 1")
-        if triangles.min() < 0 or triangles.max() >= len(points):
+        if triangles.ndim != 2 or triangles.shape[1] != 3:
+            raise InputError(f"faces: got shape {triangles.shape}, expected (m, 3)")
+        if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(points)):
             raise InputError(
                 f"faces: indices {triangles.min()} … {triangles.max()}, expected 0 … {len(points) - 1}: one per vertex"
             )
@@ -77,14 +77,22 @@ class TriangleTree:
 
     @property
     def bounds(self) -> FloatArray:
-        """(2, 3) mm, lowest and highest corner."""
+        """(2, 3) mm, lowest and highest corner; NaN where there is no triangle."""
+        if len(self.arrays.order) == 0:
+            return np.full((2, 3), np.nan)
         return np.array(self.arrays.boxes[0].reshape(2, 3))
 
     def closest(self, points: ArrayLike) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Return distance (...) mm ≥ 0, nearest point (..., 3) and its face (...) for points (..., 3)."""
+        """Return distance (...) mm ≥ 0, nearest point (..., 3) and its face (...) for points (..., 3).
+
+        Without triangles: inf, NaN, −1.
+        """
         shape, flat = _flat(points, "points")
         distance, nearest, face = np.empty(len(flat)), np.empty((len(flat), 3)), np.empty(len(flat), dtype=np.int64)
-        _in_parts(kernels.nearest_points, len(flat), self.arrays, (flat, distance, nearest, face))
+        if len(self.arrays.order) == 0:
+            distance[:], nearest[:], face[:] = np.inf, np.nan, -1
+        else:
+            _in_parts(kernels.nearest_points, len(flat), self.arrays, (flat, distance, nearest, face))
         return distance.reshape(shape), nearest.reshape(*shape, 3), face.reshape(shape)
 
     def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
@@ -114,6 +122,8 @@ class TriangleTree:
         first, along = _pair(origins, directions)
         if not max_t > 0:
             raise InputError(f"max_t: got {max_t}, expected a number > 0")
+        if len(self.arrays.order) == 0:
+            return np.full(len(first), np.nan), np.full(len(first), -1)
         length = np.sqrt((along * along).sum(axis=1))
         reach = np.sqrt((np.maximum(np.abs(first - self.bounds[0]), np.abs(first - self.bounds[1])) ** 2).sum(axis=1))
         with np.errstate(divide="ignore", invalid="ignore"):

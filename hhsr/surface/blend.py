@@ -63,7 +63,7 @@ def outline(piece: Piece, height: float, up: bool) -> FloatArray:
     keys = edges[:, 0] * len(piece.vertices) + edges[:, 1]
     twins = edges[:, 1] * len(piece.vertices) + edges[:, 0]
     rim = edges[~np.isin(keys, twins)]
-    return piece.vertices[rim if up else rim[:, ::-1]][:, :, :2]
+    return np.asarray(piece.vertices[rim if up else rim[:, ::-1]][:, :, :2])
 
 
 def _polar(radius: FloatArray, angles: FloatArray) -> FloatArray:

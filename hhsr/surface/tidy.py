@@ -7,24 +7,23 @@ import numpy as np
 from hhsr.model import FloatArray, IntArray
 from hhsr.surface.piece import Piece
 
-PASSES = 6
+PASSES = 4
+DETOUR = 0.01  # mm that a way may be longer if what stays is then exact
 
 
-def tidy(piece: Piece, shortest_mm: float) -> Piece:
-    """Return the piece without edges shorter than `shortest_mm`, as far as its topology allows; no vertex moves.
+def tidy(piece: Piece, shortest_mm: float, storable_mm: float) -> Piece:
+    """Return the piece without edges shorter than `shortest_mm`, where what stays is exact: no vertex moves.
 
-    Of an edge's ends that one stays which lies on more surfaces, so that what stays is exact.
+    Of an edge's ends that one stays which lies on all surfaces of the other. Edges shorter than `storable_mm` go even
+    where there is none such, as far as the surface stays a manifold.
     """
-    for attempt in range(PASSES):
-        short = _short_edges(piece, shortest_mm)
-        if len(short) == 0:
-            break
-        smaller = _collapse(piece, short, careful=attempt < PASSES // 2)
-        if smaller is None:
-            if attempt >= PASSES // 2:
+    for length, careful in ((shortest_mm, True), (storable_mm, False)):
+        for _ in range(PASSES):
+            short = _short_edges(piece, length)
+            smaller = _collapse(piece, short, careful) if len(short) else None
+            if smaller is None:
                 break
-            continue
-        piece = smaller
+            piece = smaller
     return piece
 
 
@@ -38,34 +37,68 @@ def _short_edges(piece: Piece, shortest_mm: float) -> IntArray:
 
 
 def _collapse(piece: Piece, short: IntArray, careful: bool) -> Piece | None:
-    """Return the piece after as many collapses as go, or None. careful: no face may turn over."""
-    faces = piece.faces.copy()
-    around = _Around(faces)
-    alive = np.ones(len(faces), dtype=bool)
+    """Return the piece after as many collapses as go, or None. careful: no face turns over, no surface is left."""
+    surface = _Surface(piece)
     done = 0
     for a, b in short.tolist():
-        ring_a, ring_b = around.faces(a), around.faces(b)
-        shared = [f for f in ring_a if f in ring_b]
-        if len(shared) != 2:  # one of them went with an earlier collapse
-            continue
-        if set(faces[list(ring_a)].ravel()) & set(faces[list(ring_b)].ravel()) - set(faces[shared].ravel()):
-            continue  # a third common neighbour: the surface would touch itself
-        sources_a = set(piece.source[list(ring_a)].tolist())
-        sources_b = set(piece.source[list(ring_b)].tolist())
-        gone, kept = (a, b) if sources_a <= sources_b or len(sources_a) < len(sources_b) else (b, a)
-        moving = [f for f in around.faces(gone) if f not in shared]
-        if careful and _turns_over(piece.vertices, faces[moving], gone, kept):
-            continue
-        if _repeats(faces, moving, gone, kept, [f for f in around.faces(kept) if f not in shared]):
-            continue
-        faces[moving] = np.where(faces[moving] == gone, kept, faces[moving])
-        alive[shared] = False
-        around.merge(gone, kept, shared, faces)
-        done += 1
-    if not done:
-        return None
-    used, numbers = np.unique(faces[alive], return_inverse=True)
-    return Piece(piece.vertices[used], numbers.reshape(-1, 3), piece.source[alive])
+        if not surface.joined(a, b):
+            continue  # one of them went with an earlier collapse
+        ways = [way for way in ((a, b), (b, a)) if surface.exact(*way)]
+        if not careful:
+            ways += [(a, b), (b, a), *surface.detours(a, b)]
+        done += any(surface.collapse(*way, careful) for way in ways)
+    return surface.piece() if done else None
+
+
+class _Surface:
+    """Triangles whose vertices merge."""
+
+    def __init__(self, piece: Piece) -> None:
+        self._vertices, self._faces, self._source = piece.vertices, piece.faces.copy(), piece.source
+        self._alive = np.ones(len(self._faces), dtype=bool)
+        self._around = _Around(self._faces)
+
+    def joined(self, a: int, b: int) -> bool:
+        """Return whether two vertices are still the ends of an edge."""
+        return bool(self._around.faces(a) & self._around.faces(b))
+
+    def exact(self, gone: int, kept: int) -> bool:
+        """Return whether `kept` lies on all the surfaces that `gone` lies on."""
+        of_gone, of_kept = (set(self._source[list(self._around.faces(v))].tolist()) for v in (gone, kept))
+        return of_gone <= of_kept
+
+    def detours(self, a: int, b: int) -> list[tuple[int, int]]:
+        """Return other collapses that take one end of a stubborn edge away: short ones first, exact ones before."""
+        ways = [(v, w) for v in (a, b) for w in self._neighbours(v) - {a, b}]
+        return sorted(ways, key=lambda way: self._length(*way) + (0.0 if self.exact(*way) else DETOUR))
+
+    def _length(self, a: int, b: int) -> float:
+        return float(np.linalg.norm(self._vertices[a] - self._vertices[b]))
+
+    def _neighbours(self, vertex: int) -> set[int]:
+        return set(self._faces[list(self._around.faces(vertex))].ravel().tolist()) - {vertex}
+
+    def collapse(self, gone: int, kept: int, careful: bool) -> bool:
+        """Merge `gone` into `kept` if the surface stays a manifold; return whether it was done."""
+        ring, other = self._around.faces(gone), self._around.faces(kept)
+        shared = sorted(ring & other)
+        if len(shared) != 2 or len(self._neighbours(gone) & self._neighbours(kept)) != 2:
+            return False  # a third common neighbour: the surface would touch itself
+        moving = sorted(ring - other)
+        if careful and _turns_over(self._vertices, self._faces[moving], gone, kept):
+            return False
+        moved = np.where(self._faces[moving] == gone, kept, self._faces[moving])
+        known = {frozenset(f) for f in self._faces[sorted(other - ring)].tolist()}
+        if any(frozenset(f) in known for f in moved.tolist()):
+            return False
+        self._faces[moving] = moved
+        self._alive[shared] = False
+        self._around.merge(gone, kept, shared, self._faces)
+        return True
+
+    def piece(self) -> Piece:
+        used, numbers = np.unique(self._faces[self._alive], return_inverse=True)
+        return Piece(self._vertices[used], numbers.reshape(-1, 3), self._source[self._alive])
 
 
 class _Around:
@@ -95,9 +128,3 @@ def _turns_over(vertices: FloatArray, faces: IntArray, gone: int, kept: int) -> 
     n0 = np.cross(before[:, 1] - before[:, 0], before[:, 2] - before[:, 0])
     n1 = np.cross(after[:, 1] - after[:, 0], after[:, 2] - after[:, 0])
     return bool((np.einsum("ij,ij->i", n0, n1) < 0).any())
-
-
-def _repeats(faces: IntArray, moving: list[int], gone: int, kept: int, others: list[int]) -> bool:
-    """Return whether a moved face would hold the same three vertices as another."""
-    known = {frozenset(f) for f in faces[others].tolist()}
-    return any(frozenset(f) in known for f in np.where(faces[moving] == gone, kept, faces[moving]).tolist())

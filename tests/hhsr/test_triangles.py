@@ -176,7 +176,7 @@ def test_skewed_sizes_keep_the_tree_shallow() -> None:
 
 def test_bad_input_is_named() -> None:
     with pytest.raises(InputError, match="faces"):
-        TriangleTree(np.zeros((3, 3)), np.zeros((0, 3), dtype=int))
+        TriangleTree(np.zeros((3, 3)), np.zeros((2, 4), dtype=int))
     with pytest.raises(InputError, match="indices 0 … 3"):
         TriangleTree(np.eye(3), [[0, 1, 3]])
     with pytest.raises(InputError, match="not finite"):
@@ -186,6 +186,14 @@ def test_bad_input_is_named() -> None:
         tree.crossings(np.zeros((2, 3)), np.zeros((3, 3)))
     assert tree.closest(np.zeros((0, 3)))[0].shape == (0,)
     assert tree.closest(np.zeros((4, 2, 3)))[1].shape == (4, 2, 3)
+
+
+def test_no_triangles_hold_and_meet_nothing() -> None:
+    tree = TriangleTree(np.zeros((0, 3)), np.zeros((0, 3), dtype=int))
+    assert not tree.contains(np.eye(3)).any()
+    assert (tree.closest(np.eye(3))[0] == np.inf).all()
+    assert len(tree.crossings(np.eye(3), -np.eye(3)).t) == 0
+    assert np.isnan(tree.first_hit(np.eye(3), np.eye(3))[0]).all()
 
 
 coordinates = st.integers(-3, 3).map(lambda i: i * 0.1) | st.floats(-1e3, 1e3)
