@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from devices.clock import Clock, ManualClock, SystemClock
     from devices.errors import DeviceError, DeviceInputError, ProtocolError, TrackerError, TransportError
     from devices.frame import ToolPose, ToolStatus, TrackerFrame
+    from devices.igtl import IgtlServer, IgtlTracker
     from devices.ndi.tracker import NdiTracker
     from devices.recording import Recorder, ReplayTracker
     from devices.registry import open_tracker
@@ -28,6 +29,7 @@ _HOMES = {
     "clock": ("Clock", "ManualClock", "SystemClock"),
     "errors": ("DeviceError", "DeviceInputError", "ProtocolError", "TrackerError", "TransportError"),
     "frame": ("ToolPose", "ToolStatus", "TrackerFrame"),
+    "igtl": ("IgtlServer", "IgtlTracker"),
     "ndi.tracker": ("NdiTracker",),
     "recording": ("Recorder", "ReplayTracker"),
     "registry": ("open_tracker",),
@@ -41,6 +43,8 @@ __all__ = [
     "Clock",
     "DeviceError",
     "DeviceInputError",
+    "IgtlServer",
+    "IgtlTracker",
     "ManualClock",
     "NdiTracker",
     "ProtocolError",

@@ -22,9 +22,20 @@ class Clock(ABC):
     def wait_until(self, time_s: float, interrupt: Event | None = None) -> None:
         """Return when the clock shows `time_s`, or earlier once `interrupt` is set."""
 
+    def unix_s(self, time_s: float) -> float:
+        """Return the Unix time of a reading, for peers on other machines; a simulated clock gives its own."""
+        return time_s
+
 
 class SystemClock(Clock):
     """The machine's monotonic clock: the only reader of real time in the project."""
+
+    def __init__(self) -> None:
+        self._unix_offset_s = time.time() - time.monotonic()
+
+    def unix_s(self, time_s: float) -> float:
+        """Return the Unix time of a reading, by the offset at the time this clock was made."""
+        return time_s + self._unix_offset_s
 
     def now_s(self) -> float:
         """Return the monotonic time, s."""

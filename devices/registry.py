@@ -128,8 +128,20 @@ def _open_ndi(url: str, place: str, parameters: Parameters, clock: Clock | None)
     return NdiTracker(place, roms=roms, names=names, clock=clock, **_taken(url, parameters, readers))
 
 
+def _open_igtl(url: str, place: str, parameters: Parameters, clock: Clock | None) -> Tracker:
+    from devices.igtl import DEFAULT_PORT, IgtlTracker
+
+    host, colon, port = place.removeprefix("//").rstrip("/").rpartition(":")
+    if not colon:
+        host, port = port, str(DEFAULT_PORT)
+    if not port.isdigit():
+        raise DeviceInputError(f"{url!r}: expected igtl://HOST:PORT")
+    return IgtlTracker(host.strip("[]"), int(port), clock=clock, **_taken(url, parameters, {"latency_s": float}))
+
+
 _OPENERS: dict[str, Callable[[str, str, Parameters, Clock | None], Tracker]] = {
     "sim": _open_sim,
     "replay": _open_replay,
     "ndi": _open_ndi,
+    "igtl": _open_igtl,
 }

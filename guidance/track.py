@@ -112,7 +112,7 @@ def track(
     record: Annotated[Path | None, typer.Option(help="Write every frame to this file (JSON lines).")] = None,
     duration: Annotated[float | None, typer.Option(help="Stop after so many seconds.", min=0.0)] = None,
 ) -> None:
-    """Show a live table of a tracker's tools: status, position, error, rate, age; until the recording's end or Ctrl-C."""
+    """Show a live table of the tools: status, position, error, rate, age; until the recording ends or Ctrl-C."""
     console = Console()
     try:
         with ExitStack() as stack:
