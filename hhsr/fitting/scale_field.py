@@ -1,0 +1,111 @@
+"""A leaf from its rows: the ellipsoid of six half axes, and scale-field centres chosen greedily (DESIGN §1, §3)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from hhsr.fitting.rows import Rows
+from hhsr.kernels.selection import back_substituted, dictionary_rows, orthogonal_selection, solve_normal
+from hhsr.model import CentreGrid, FloatArray, IntArray, ModelLeaf, ScaleField, Superquadric
+
+RATIO = 1.6
+SUPPORT = 2.5
+COARSEST = 20
+RIDGE = 1e-5
+NO_AXES = np.zeros(0)
+
+
+class Selection(NamedTuple):
+    """Centres of one leaf in the order in which they pay.
+
+    index: (k,) atoms of the grid. gains: (k,) fall of the rows' sum of squares, mm². triangle, right: see
+    `hhsr.kernels.selection.orthogonal_selection`.
+    """
+
+    grid: CentreGrid
+    index: IntArray
+    gains: FloatArray
+    triangle: FloatArray
+    right: FloatArray
+
+    def field(self, count: int) -> ScaleField:
+        """Return the scale field of the first `count` centres."""
+        weights = back_substituted(self.triangle, self.right, count)
+        order = np.argsort(self.index[:count], kind="stable")
+        return ScaleField(self.grid, self.index[:count][order], weights[order])
+
+
+def grid_for(finest: int) -> CentreGrid:
+    """Return the dictionary whose finest grid has about `finest` centres; each coarser one is spaced 1.6 times wider."""
+    sizes = [max(finest, COARSEST)]
+    while sizes[-1] / RATIO**2 >= COARSEST:
+        sizes.append(round(sizes[-1] / RATIO**2))
+    return CentreGrid(tuple(sorted(sizes)), SUPPORT)
+
+
+def dictionary(grid: CentreGrid, directions: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the compressed rows of λ over the whole grid, for (n, 3) unit directions."""
+    starts = np.concatenate([[0], np.cumsum(grid.sizes)]).astype(np.int64)
+    extents = grid.extents[starts[:-1]].copy()
+    return dictionary_rows(np.ascontiguousarray(directions), grid.centres, starts, extents)
+
+
+def ellipsoid_radii(half_axes: FloatArray, directions: FloatArray) -> FloatArray:
+    """Return (n,) radii q of the ellipsoid of six half axes in (n, 3) unit directions."""
+    radii: FloatArray = 1.0 / np.sqrt(((directions / _axes_seen(half_axes, directions)) ** 2).sum(axis=1))
+    return radii
+
+
+def _axes_seen(half_axes: FloatArray, directions: FloatArray) -> FloatArray:
+    """Return (n, 3) the half axes of each direction's octant."""
+    return np.where(directions >= 0.0, half_axes[0::2], half_axes[1::2])
+
+
+def fit_ellipsoid(rows: Rows, iterations: int = 12) -> FloatArray:
+    """Return the (6,) half axes whose ellipsoid lies nearest to the rows: Gauss-Newton on their logarithms.
+
+    A bound counts only while it is broken; an axis that no row tells stays near the mean radius (ridge 10⁻³).
+    """
+    told = ~rows.bound if (~rows.bound).any() else rows.bound
+    mean = float((rows.weights * rows.radii)[told].sum() / max(rows.weights[told].sum(), 1e-300))
+    logs = np.full(6, math.log(mean))
+    ridge = 1e-3 * float((rows.weights**2).sum()) * mean**2 / 6.0
+    for _ in range(iterations):
+        axes = np.exp(logs)
+        q = ellipsoid_radii(axes, rows.directions)
+        miss = rows.radii - q
+        weight = np.where(rows.bound & (miss <= 0.0), 0.0, rows.weights**2)
+        slopes = q[:, None] ** 3 * (rows.directions / _axes_seen(axes, rows.directions)) ** 2
+        jacobian = np.concatenate([slopes * (rows.directions >= 0.0), slopes * (rows.directions < 0.0)], axis=1)
+        order = [0, 3, 1, 4, 2, 5]
+        jacobian = jacobian[:, order]
+        normal = np.einsum("n,ni,nj->ij", weight, jacobian, jacobian) + ridge * np.eye(6)
+        right = np.einsum("n,ni,n->i", weight, jacobian, miss) + ridge * (math.log(mean) - logs)
+        logs = logs + np.clip(solve_normal(normal, right), -0.5, 0.5)
+    return np.exp(np.clip(logs, math.log(0.05 * mean), math.log(20.0 * mean)))
+
+
+def select_centres(
+    rows: Rows, half_axes: FloatArray, grid: CentreGrid, count: int, current: FloatArray | None = None
+) -> Selection:
+    """Return up to `count` centres that bring the leaf nearest to the rows.
+
+    current: (n,) radii of the leaf so far, which tells the bounds that are broken; None: of the bare ellipsoid.
+    """
+    q = ellipsoid_radii(half_axes, rows.directions)
+    known = q if current is None else current
+    weights = np.where(rows.bound & (known >= rows.radii), 0.0, rows.weights)
+    kept = np.flatnonzero(weights > 0.0)
+    pointer, index, value = dictionary(grid, rows.directions[kept])
+    scale = (weights * q)[kept]
+    target = (weights * (q - rows.radii))[kept]
+    chosen, gains, triangle, right = orthogonal_selection(pointer, index, value, scale, target, grid.size, count, RIDGE)
+    return Selection(grid, chosen, gains, triangle, right)
+
+
+def leaf_of(centre: FloatArray, half_axes: FloatArray, field: ScaleField) -> ModelLeaf:
+    """Return the leaf: an ellipsoid on the tree's axes with a scale field."""
+    return ModelLeaf(centre, NO_AXES, Superquadric(half_axes), field)
