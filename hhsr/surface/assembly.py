@@ -9,6 +9,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from hhsr.check import as_float
+from hhsr.compiled import compile_tree
 from hhsr.model import Cut, FloatArray, IntArray, Node, RetainedPart, Tree, cuts, leaves, rotation_matrix
 from hhsr.surface.blend import outline, slab_body
 from hhsr.surface.piece import Bodies, Piece
@@ -120,8 +121,6 @@ class _Assembly:
 
     def _band_tables(self) -> BandTables:
         if self._tables is None:
-            from hhsr.compiled import compile_tree
-
             self._tables = compile_tree(self.tree).band_tables
         return self._tables
 

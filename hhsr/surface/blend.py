@@ -11,7 +11,7 @@ from hhsr.surface.piece import Piece
 from hhsr.surface.sources import Strip
 
 JOIN = 0.01  # mm: an outline this near to the band's own end is the band's end
-COARSEST, FINEST = 32, 4096
+COARSEST, FINEST = 32, 1024
 
 
 def slab_body(
@@ -27,25 +27,19 @@ def slab_body(
     angles = -np.pi + 2.0 * np.pi * np.arange(count) / count
     rows = _rows_needed(strip, angles, tolerance_mm)
     rings = [_end_ring(strip, 0.0, below, angles)]
-    for share in np.arange(1, rows) / rows:
-        radius = strip.radius(angles, np.full(count, share))
-        rings.append(np.column_stack([_polar(radius, angles), np.full(count, (2.0 * share - 1.0) * d)]))
+    shares = np.arange(1, rows) / rows
+    rings += [(centre + _polar(_radius(strip, angles, share), angles), angles) for share in shares]
     rings.append(_end_ring(strip, 1.0, above, angles))
-    rings[0][:, 2], rings[-1][:, 2] = -d, d
-    for ring in rings:
-        ring[:, :2] += centre
-    starts = np.cumsum([0, *(len(r) for r in rings)])
-    vertices = np.concatenate([*rings, [[*centre, -d], [*centre, d]]])
-    sides = [
-        _between(_angle(a - [*centre, 0.0]), _angle(b - [*centre, 0.0]), starts[i], starts[i + 1])
-        for i, (a, b) in enumerate(pairwise(rings))
-    ]
-    low, high = starts[0] + np.arange(len(rings[0])), starts[-2] + np.arange(len(rings[-1]))
-    bottom = np.stack([np.full(len(low), len(vertices) - 2), np.roll(low, -1), low], axis=1)
-    top = np.stack([np.full(len(high), len(vertices) - 1), high, np.roll(high, -1)], axis=1)
-    wall = np.concatenate(sides)
+    heights = [-d, *((2.0 * shares - 1.0) * d), d]
+    starts = np.cumsum([0, *(len(points) for points, _ in rings)])
+    flat = np.concatenate([*(points for points, _ in rings), [centre, centre]])
+    height = np.concatenate([np.repeat(heights, np.diff(starts)), [-d, d]])
+    wall = np.concatenate([_between(a[1], b[1], *starts[i : i + 2]) for i, (a, b) in enumerate(pairwise(rings))])
+    low, high = np.arange(starts[1]), np.arange(starts[-2], starts[-1])
+    bottom = np.stack([np.full(len(low), len(flat) - 2), np.roll(low, -1), low], axis=1)
+    top = np.stack([np.full(len(high), len(flat) - 1), high, np.roll(high, -1)], axis=1)
     return Piece(
-        vertices,
+        np.column_stack([flat, height]),
         np.concatenate([wall, bottom, top]),
         np.repeat([source, *steps], [len(wall), len(bottom), len(top)]),
     )
@@ -78,50 +72,58 @@ def _angles_needed(strip: Strip, tolerance_mm: float) -> int:
     """Return the least power of two of chords that keep within the tolerance of the strip at five heights."""
     count = COARSEST
     while count < FINEST:
-        angles = -np.pi + 2.0 * np.pi * np.arange(4 * count) / (4 * count)
+        between = max(4, 512 // count)  # none of the table's 256 corners goes unseen
+        angles = -np.pi + 2.0 * np.pi * np.arange(between * count) / (between * count)
         worst = 0.0
         for share in (0.0, 0.25, 0.5, 0.75, 1.0):
-            points = _polar(strip.radius(angles, np.full(4 * count, share)), angles).reshape(count, 4, 2)
+            radius = _radius(strip, angles, share)
+            points = _polar(radius, angles).reshape(count, between, 2)
             start, end = points[:, 0], np.roll(points[:, 0], -1, axis=0)
             along = (end - start) / np.maximum(np.linalg.norm(end - start, axis=1, keepdims=True), 1e-300)
-            for k in (1, 2, 3):
-                off = points[:, k] - start
-                worst = max(worst, float(np.abs(along[:, 0] * off[:, 1] - along[:, 1] * off[:, 0]).max()))
+            off = points[:, 1:] - start[:, None]
+            worst = max(worst, float(np.abs(along[:, :1] * off[:, :, 1] - along[:, 1:] * off[:, :, 0]).max()))
         if worst <= tolerance_mm:
             return count
         count *= 2
     return FINEST
 
 
+def _radius(strip: Strip, angles: FloatArray, share: float) -> FloatArray:
+    return strip.radius(angles, np.full(angles.shape, share))
+
+
 def _rows_needed(strip: Strip, angles: FloatArray, tolerance_mm: float) -> int:
     """Return how many rows keep the parabolas within the tolerance; at least 2, for the contour itself."""
-    ends = [strip.radius(angles, np.full(len(angles), t)) for t in (0.0, 0.5, 1.0)]
+    ends = [_radius(strip, angles, t) for t in (0.0, 0.5, 1.0)]
     sag = float(np.abs(ends[0] - 2.0 * ends[1] + ends[2]).max()) / 2.0
     return min(max(2, int(np.ceil(np.sqrt(sag / tolerance_mm)))), 64)
 
 
-def _end_ring(strip: Strip, share: float, edges: FloatArray, angles: FloatArray) -> FloatArray:
-    """Return (k, 3) a band's end about its centre: the child's outline where it fits, else the band's own radii."""
+def _end_ring(strip: Strip, share: float, edges: FloatArray, angles: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a band's end, points (k, 2) and ascending angles (k,): the child's outline where it fits, else its own.
+
+    The outline's coordinates are taken over to the bit, so that the Boolean finds the ends the same.
+    """
     centre = strip.model.contours[strip.lobe].centre
     local = edges - centre
     radius, angle = np.linalg.norm(local, axis=2), np.arctan2(local[:, :, 1], local[:, :, 0])
-    wanted = strip.radius(angle.ravel(), np.full(angle.size, share)).reshape(angle.shape)
+    wanted = _radius(strip, angle.ravel(), share).reshape(angle.shape)
     turn = np.mod(angle[:, 1] - angle[:, 0] + np.pi, 2.0 * np.pi) - np.pi
-    fits = (np.abs(radius - wanted) <= JOIN).all(axis=1) & (turn > 1e-9) & (turn < 0.5)
+    fits = (
+        (np.abs(radius - wanted) <= JOIN).all(axis=1) & (wanted > 2.0 * JOIN).all(axis=1) & (turn > 1e-9) & (turn < 0.5)
+    )
     first, span = angle[fits, 0], turn[fits]
     position = np.argsort(first)
     first, span = first[position], span[position]
     free = np.ones(len(angles), dtype=bool)
     for begin, length in zip(first, span, strict=True):
         free &= np.mod(angles - begin + 1e-9, 2.0 * np.pi) > length + 2e-9
-    points = np.concatenate(
-        [local[fits].reshape(-1, 2), _polar(strip.radius(angles, np.full(len(angles), share)), angles)[free]]
-    )
-    order = np.argsort(_angle(points), kind="stable")
-    points = points[order]
-    gaps = np.diff(_angle(points), append=_angle(points[:1]) + 2.0 * np.pi)
-    points = points[gaps > 1e-9]
-    return np.column_stack([points, np.zeros(len(points))])
+    points = np.concatenate([edges[fits].reshape(-1, 2), centre + _polar(_radius(strip, angles, share), angles)[free]])
+    angle = np.concatenate([angle[fits].ravel(), angles[free]])
+    order = np.argsort(angle, kind="stable")
+    points, angle = points[order], angle[order]
+    apart = np.diff(angle, append=angle[:1] + 2.0 * np.pi) > 1e-9
+    return points[apart], angle[apart]
 
 
 def _between(low: FloatArray, high: FloatArray, low_start: int, high_start: int) -> IntArray:

@@ -11,6 +11,8 @@ from hhsr.evaluate import LeafArrays, contour_radius, leaf_arrays
 from hhsr.kernels.leaf import leaf_radii
 from hhsr.model import Cut, FloatArray, ModelLeaf, rotation_matrix
 
+THINNEST = 1e-3  # mm
+
 
 @dataclass(frozen=True, eq=False)
 class Patch:
@@ -64,11 +66,16 @@ class Strip:
     right: FloatArray = field(repr=False)
 
     def radius(self, angle: FloatArray, share: FloatArray) -> FloatArray:
-        """Return r(α, t) (n,) mm for (n,) angles and shares t of the way from −d to +d."""
+        """Return r(α, t) (n,) mm for (n,) angles and shares t of the way from −d to +d.
+
+        Where the formula gives less than THINNEST the band holds nothing, and its surface is a thread about the centre.
+        """
         left, right = _at(self.left, angle), _at(self.right, angle)
         middle = 2.0 * contour_radius(self.model.contours[self.lobe], angle) - 0.5 * (left + right)
         rest = 1.0 - share
-        return np.asarray(rest * rest * left + 2.0 * share * rest * middle + share * share * right)
+        return np.asarray(
+            np.maximum(rest * rest * left + 2.0 * share * rest * middle + share * share * right, THINNEST)
+        )
 
     def miss(self, points: FloatArray) -> FloatArray:
         """Return |p∥ − c| − r (n,) mm of (n, 3) points of the tree's frame."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from hhsr.compiled import compile_tree
 from hhsr.errors import InputError, SurfaceError
 from hhsr.evaluate import leaf_radius
 from hhsr.model import (
@@ -131,7 +132,7 @@ def step_faces(root: Node, corners: np.ndarray, normal: np.ndarray, tables: dict
     right = holds(root, middle - 1e-6 * side, tables) & ~holds(root, middle + 1e-6 * side, tables)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     assert right[2.0 * area / longest > 0.1].all()
-    assert area[~right].sum() <= 0.02 * area.sum() + 0.05
+    assert area[~right].sum() <= 0.02 * area.sum() + 0.3  # mm², along outlines of some 100 mm
 
 
 def test_ball_is_a_ball() -> None:
@@ -300,6 +301,30 @@ def test_a_band_under_a_cut_and_a_band_over_it() -> None:
     tables = tables_of(whole)
     mesh = reconstruct(Tree(whole, NO_POSE), 0.02, [tables[id(c)] for c in cuts(whole)])
     check(Tree(whole, NO_POSE), mesh, tables)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_bands_that_hardly_hold(seed: int, tmp_path: Path) -> None:
+    """Contours drawn at random: sections are missed, lobes overlap, radii vanish; the set is still one, and closed."""
+    rng = np.random.default_rng(seed)
+
+    def lobe() -> Contour:
+        centre, axes = frozen(rng.normal(size=2) * 6), frozen(rng.uniform(8, 25, 4))
+        return Contour(centre, axes, frozen([]), frozen(rng.normal(size=6) * 0.05))
+
+    def wild(depth: int) -> Node:
+        if depth == 0:
+            return random_leaf(rng) if rng.random() < 0.8 else random_part(rng)
+        cut = random_cut(rng, wild(depth - 1), wild(depth - 1))
+        lobes = tuple(lobe() for _ in range(rng.integers(1, 3)))
+        return Cut(cut.normal_angles, cut.offset, float(rng.uniform(0.2, 3.0)), lobes, cut.left, cut.right)
+
+    tree = Tree(wild(1 + seed % 2), NO_POSE)
+    tables = compile_tree(tree).band_tables
+    mesh = reconstruct(tree, 0.1)
+    check(tree, mesh, {id(c): list(t) for c, t in zip(cuts(tree.root), tables, strict=True)}, seed)
+    mesh.export(tmp_path / "shape.ply")
+    assert trimesh.load(tmp_path / "shape.ply").is_watertight
 
 
 def test_open_triangles_and_bad_tolerances_are_refused() -> None:
