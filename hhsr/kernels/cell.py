@@ -1,0 +1,259 @@
+"""One cell of a leaf's cube map: exact values and proven linear models of W over a rectangle of directions.
+
+On a face of the cube of directions, with major axis k and minor coordinates (a, b), a point is p = m·(1, a, b).
+W(a, b) = |dir|/ρ = N(dir)/(1 − s), so p is inside where 1/m > W: (a, b, 1/m) is a projective map, in which segments
+stay straight and the surface is a height field (DESIGN §4).
+"""
+
+import math
+
+from numba import njit
+
+from hhsr.kernels.interval import product, widened
+from hhsr.kernels.layout import (
+    AZIMUTH,
+    AZIMUTH_COUNT,
+    BLOCKS,
+    BLOCKS_PER_SIDE,
+    CENTRE_COUNT,
+    CENTRE_SIZE,
+    CENTRES,
+    ELEVATION,
+    ELEVATION_COUNT,
+    HALF_AXES,
+)
+from hhsr.kernels.leaf import MAX_SCALE
+from hhsr.kernels.norm_bounds import norm_range
+from hhsr.kernels.superquadric import superquadric_norm
+
+
+@njit(cache=True)
+def face_of(x, y, z):
+    """Return (face, a, b, m) of a point that is not the centre: face 2k for the positive major axis k, 2k + 1 else."""
+    ux, uy, uz = abs(x), abs(y), abs(z)
+    if ux >= uy and ux >= uz:
+        return (0 if x >= 0.0 else 1), y / ux, z / ux, ux
+    if uy >= uz:
+        return (2 if y >= 0.0 else 3), z / uy, x / uy, uy
+    return (4 if z >= 0.0 else 5), x / uz, y / uz, uz
+
+
+@njit(cache=True)
+def direction_of(face, a, b):
+    """Return the direction (x, y, z), of |·|∞ = 1, that belongs to (a, b) on a face."""
+    m = 1.0 if face % 2 == 0 else -1.0
+    if face < 2:
+        return m, a, b
+    if face < 4:
+        return b, m, a
+    return a, b, m
+
+
+@njit(cache=True)
+def chart_of(face, x, y, z):
+    """Return (a, b, m) of a point on a given face: minor coordinates over the major one, and the major one."""
+    if face < 2:
+        m = x if face == 0 else -x
+        return y / m, z / m, m
+    if face < 4:
+        m = y if face == 2 else -y
+        return z / m, x / m, m
+    m = z if face == 4 else -z
+    return x / m, y / m, m
+
+
+@njit(cache=True)
+def block_of(face, a, b):
+    """Return the index of the block of directions that holds (a, b)."""
+    half = 0.5 * BLOCKS_PER_SIDE
+    i = min(max(int((a + 1.0) * half), 0), BLOCKS_PER_SIDE - 1)
+    j = min(max(int((b + 1.0) * half), 0), BLOCKS_PER_SIDE - 1)
+    return (face * BLOCKS_PER_SIDE + i) * BLOCKS_PER_SIDE + j
+
+
+@njit(cache=True)
+def scale_in_block(blob, ints, leaf, block, ux, uy, uz):
+    """Return s(u), summed over the centres of the block in the order of the record: the same float as over all."""
+    total = 0.0
+    rows = ints[leaf + CENTRES]
+    start = ints[leaf + BLOCKS]
+    for i in range(ints[start + block], ints[start + block + 1]):
+        o = rows + CENTRE_SIZE * ints[i]
+        h = (1.0 - (ux * blob[o] + uy * blob[o + 1] + uz * blob[o + 2])) * blob[o + 3]
+        if h < 1.0:
+            rest = 1.0 - h
+            total += blob[o + 4] * (math.exp(-4.0 * h) * rest * rest)
+    return total
+
+
+@njit(cache=True)
+def norm_at(blob, ints, leaf, x, y, z):
+    """Return the superquadric's norm N of a leaf at (x, y, z)."""
+    n, m = ints[leaf + AZIMUTH_COUNT], ints[leaf + ELEVATION_COUNT]
+    h, s, e = ints[leaf + HALF_AXES], ints[leaf + AZIMUTH], ints[leaf + ELEVATION]
+    if n == 0 and m == 0:
+        sx = x / blob[h] if x >= 0.0 else -x / blob[h + 1]
+        sy = y / blob[h + 2] if y >= 0.0 else -y / blob[h + 3]
+        sz = z / blob[h + 4] if z >= 0.0 else -z / blob[h + 5]
+        return math.sqrt(sx * sx + sy * sy + sz * sz)
+    return superquadric_norm(
+        x, y, z, blob[h : h + 6], blob[s : s + 4 * n].reshape(n, 4), blob[e : e + 4 * m].reshape(m, 4)
+    )
+
+
+@njit(cache=True)
+def leaf_implicit(blob, ints, leaf, x, y, z):
+    """Return G(p) = N(p) + s(p/|p|) − 1 in the leaf's frame: ≤ 0 inside. The exact formula behind every answer."""
+    length = math.sqrt(x * x + y * y + z * z)
+    if length == 0.0:
+        return MAX_SCALE - 1.0
+    face, a, b, _ = face_of(x, y, z)
+    s = scale_in_block(blob, ints, leaf, block_of(face, a, b), x / length, y / length, z / length)
+    return norm_at(blob, ints, leaf, x, y, z) + min(s, MAX_SCALE) - 1.0
+
+
+@njit(cache=True)
+def inverse_radius(blob, ints, leaf, face, a, b):
+    """Return W(a, b) by the exact formula."""
+    x, y, z = direction_of(face, a, b)
+    length = math.sqrt(x * x + y * y + z * z)
+    s = scale_in_block(blob, ints, leaf, block_of(face, a, b), x / length, y / length, z / length)
+    return norm_at(blob, ints, leaf, x, y, z) / (1.0 - min(s, MAX_SCALE))
+
+
+@njit(cache=True)
+def scale_range(blob, ints, leaf, block, face, a, b, half_a, half_b):
+    """Return (s, s_a_lo, s_a_hi, s_b_lo, s_b_hi): s at the centre of a rectangle and its gradient's range over it.
+
+    Value, gradient and Hessian at the centre; the rest of the gradient is at most r²/2 times the third derivative
+    along any line of the chart, or r times the second where the rectangle touches the border of a support, at which
+    the second derivative jumps. A chart line is a great circle run at speeds α' ≤ 1/L, |α''| ≤ 1/L², |α'''| ≤ 2/L³
+    (L the least |dir|), and the derivatives of λ fall with h: all bounds are closed forms at the nearest point.
+    """
+    x, y, z = direction_of(face, a, b)
+    length = math.sqrt(x * x + y * y + z * z)
+    ux, uy, uz = x / length, y / length, z / length
+    near_a, near_b = max(abs(a) - half_a, 0.0), max(abs(b) - half_b, 0.0)
+    speed = 1.0 / math.sqrt(1.0 + near_a * near_a + near_b * near_b)
+    r = math.sqrt(half_a * half_a + half_b * half_b)
+    delta = r * speed * 1.000001 + 1e-12
+    cos_delta, sin_delta = math.cos(delta), math.sin(delta)
+    q1 = 1.0 / length
+    q3 = q1 * q1 * q1
+    value = ga = gb = haa = hab = hbb = 0.0
+    rest2 = rest3 = 0.0
+    rows = ints[leaf + CENTRES]
+    start = ints[leaf + BLOCKS]
+    for i in range(ints[start + block], ints[start + block + 1]):
+        o = rows + CENTRE_SIZE * ints[i]
+        cx, cy, cz, inverse, w = blob[o], blob[o + 1], blob[o + 2], blob[o + 3], blob[o + 4]
+        tau = ux * cx + uy * cy + uz * cz
+        sine = math.sqrt(max(1.0 - tau * tau, 0.0)) + 2e-8  # what rounding can hide near τ = 1
+        top = 1.0 if tau >= cos_delta else tau * cos_delta + sine * sin_delta
+        h_lo = max((1.0 - top) * inverse, 0.0)
+        if h_lo >= 1.0:
+            continue
+        bottom = tau * cos_delta - sine * sin_delta if tau > -cos_delta else -1.0
+        inside = (1.0 - bottom) * inverse < 1.0
+        far = min(sine + delta, 1.0)
+        t1 = far * speed
+        t2 = (1.0 + far) * speed * speed
+        k = 1.0 - h_lo
+        e = math.exp(-4.0 * h_lo)
+        d1 = e * k * (4.0 * k + 2.0)
+        d2 = e * (16.0 * k * k + 16.0 * k + 2.0)
+        if inside:
+            t3 = 3.0 * (far + 1.0) * speed * speed * speed
+            d3 = e * (64.0 * k * k + 96.0 * k + 24.0)
+            rest3 += abs(w) * inverse * (d3 * inverse * inverse * t1 * t1 * t1 + 3.0 * d2 * inverse * t1 * t2 + d1 * t3)
+        else:
+            rest2 += abs(w) * inverse * (d2 * inverse * t1 * t1 + d1 * t2)
+        h = (1.0 - tau) * inverse
+        if h < 1.0:
+            if face < 2:
+                ca, cb = cy, cz
+            elif face < 4:
+                ca, cb = cz, cx
+            else:
+                ca, cb = cx, cy
+            k = 1.0 - h
+            e = math.exp(-4.0 * h)
+            value += w * (e * k * k)
+            ta = (ca - tau * a * q1) * q1
+            tb = (cb - tau * b * q1) * q1
+            first = w * inverse * e * k * (4.0 * k + 2.0)  # −w·Λ'·inverse = ∂(wλ)/∂τ
+            ga += first * ta
+            gb += first * tb
+            if inside:
+                second = w * inverse * inverse * e * (16.0 * k * k + 16.0 * k + 2.0)
+                dot = tau * length
+                haa += second * ta * ta + first * ((-2.0 * ca * a - dot) * q3 + 3.0 * dot * a * a * q3 * q1 * q1)
+                hbb += second * tb * tb + first * ((-2.0 * cb * b - dot) * q3 + 3.0 * dot * b * b * q3 * q1 * q1)
+                hab += second * ta * tb + first * ((-ca * b - cb * a) * q3 + 3.0 * dot * a * b * q3 * q1 * q1)
+    rest = 0.5 * r * r * rest3 + r * rest2
+    wide_a = abs(haa) * half_a + abs(hab) * half_b + rest
+    wide_b = abs(hab) * half_a + abs(hbb) * half_b + rest
+    return value, ga - wide_a, ga + wide_a, gb - wide_b, gb + wide_b
+
+
+@njit(cache=True)
+def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
+    """Return (value, slope_a, slope_b, error, spread_a, spread_b, lo, hi) of W over a rectangle about (a, b).
+
+    |W − value − slope·δ| ≤ error, |∂W − slope| ≤ spread and lo ≤ W ≤ hi hold on the whole rectangle, proven. The
+    rectangle must lie within one block of directions and straddle no coordinate plane.
+    """
+    block = block_of(face, a, b)
+    s, sa_lo, sa_hi, sb_lo, sb_hi = scale_range(blob, ints, leaf, block, face, a, b, half_a, half_b)
+    x, y, z = direction_of(face, a, b)
+    norm = norm_at(blob, ints, leaf, x, y, z)
+    value = norm / (1.0 - min(s, MAX_SCALE))
+    reach = max(-sa_lo, sa_hi) * half_a + max(-sb_lo, sb_hi) * half_b
+    s_lo, s_hi = s - reach, s + reach
+    if s_hi > MAX_SCALE:  # the cap: slope 0 above it
+        if s_lo > MAX_SCALE:
+            sa_lo = sa_hi = sb_lo = sb_hi = 0.0
+        sa_lo, sa_hi, sb_lo, sb_hi = min(sa_lo, 0.0), max(sa_hi, 0.0), min(sb_lo, 0.0), max(sb_hi, 0.0)
+        s_lo, s_hi = min(s_lo, MAX_SCALE), MAX_SCALE
+    d_lo, d_hi = 1.0 / (1.0 - s_lo), 1.0 / (1.0 - s_hi)
+    sign_a, sign_b = (1.0 if a >= 0.0 else -1.0), (1.0 if b >= 0.0 else -1.0)
+    a0, a1 = max(abs(a) - half_a, 0.0), abs(a) + half_a
+    b0, b1 = max(abs(b) - half_b, 0.0), abs(b) + half_b
+    m = 1.0 if face % 2 == 0 else -1.0
+    h, p, q = ints[leaf + HALF_AXES], ints[leaf + AZIMUTH_COUNT], ints[leaf + ELEVATION_COUNT]
+    axes = blob[h : h + 6]
+    o = ints[leaf + AZIMUTH]
+    azimuth = blob[o : o + 4 * p].reshape(p, 4)
+    o = ints[leaf + ELEVATION]
+    elevation = blob[o : o + 4 * q].reshape(q, 4)
+    if face < 2:
+        x0, x1, y0, y1, z0, z1, sx, sy, sz = 1.0, 1.0, a0, a1, b0, b1, m, sign_a, sign_b
+    elif face < 4:
+        x0, x1, y0, y1, z0, z1, sx, sy, sz = b0, b1, 1.0, 1.0, a0, a1, sign_b, m, sign_a
+    else:
+        x0, x1, y0, y1, z0, z1, sx, sy, sz = a0, a1, b0, b1, 1.0, 1.0, sign_a, sign_b, m
+    n_lo, n_hi, gx0, gx1, gy0, gy1, gz0, gz1 = norm_range(x0, x1, y0, y1, z0, z1, sx, sy, sz, axes, azimuth, elevation)
+    if face < 2:
+        na_lo, na_hi, nb_lo, nb_hi = gy0, gy1, gz0, gz1
+    elif face < 4:
+        na_lo, na_hi, nb_lo, nb_hi = gz0, gz1, gx0, gx1
+    else:
+        na_lo, na_hi, nb_lo, nb_hi = gx0, gx1, gy0, gy1
+    # N by its mean value form too, then W = N·D and ∂W = D·(∂N + W·∂s).
+    reach = max(-na_lo, na_hi) * half_a + max(-nb_lo, nb_hi) * half_b
+    n_lo, n_hi = max(n_lo, norm - reach), min(n_hi, norm + reach)
+    w_lo, w_hi = n_lo * d_lo, n_hi * d_hi
+    for _ in range(2):  # the second pass uses the range of W that the first one proved
+        lo, hi = product(sa_lo, sa_hi, w_lo, w_hi)
+        wa_lo, wa_hi = product(na_lo + lo, na_hi + hi, d_lo, d_hi)
+        lo, hi = product(sb_lo, sb_hi, w_lo, w_hi)
+        wb_lo, wb_hi = product(nb_lo + lo, nb_hi + hi, d_lo, d_hi)
+        reach = max(-wa_lo, wa_hi) * half_a + max(-wb_lo, wb_hi) * half_b
+        w_lo, w_hi = max(w_lo, value - reach), min(w_hi, value + reach)
+    wa_lo, wa_hi = widened(wa_lo, wa_hi)
+    wb_lo, wb_hi = widened(wb_lo, wb_hi)
+    w_lo, w_hi = widened(w_lo, w_hi)
+    slope_a, slope_b = 0.5 * (wa_lo + wa_hi), 0.5 * (wb_lo + wb_hi)
+    spread_a, spread_b = 0.5 * (wa_hi - wa_lo), 0.5 * (wb_hi - wb_lo)
+    error = (spread_a * half_a + spread_b * half_b) * (1.0 + 1e-11) + 1e-11 * abs(value)
+    return value, slope_a, slope_b, error, spread_a, spread_b, w_lo, w_hi

@@ -1,0 +1,322 @@
+"""Signed distance, nearest point and clearance of the whole solid (DESIGN §2, §4).
+
+The surface nearest to a segment is on a patch of some owner (branch and bound), on the inside of a step face (then at the
+foot of one of the segment's ends on a cutting plane, where the two sides disagree), or on a straight edge where two
+cutting planes meet (a short list made when the tree is compiled).
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from hhsr.kernels.crossing import follow_segment, scratch
+from hhsr.kernels.layout import (
+    EDGE_COUNT,
+    EDGE_FLOATS,
+    FRAME,
+    MODEL,
+    OWNER_BOX,
+    OWNER_COUNT,
+    OWNER_INT_SIZE,
+    OWNER_INTS,
+    OWNER_KIND,
+    OWNER_RECORD,
+    PLANE_COUNT,
+    PLANE_FLOATS,
+    RETAINED,
+    integers,
+    tables,
+)
+from hhsr.kernels.nearest import (
+    BEST,
+    BEST_T,
+    FOOT,
+    LENGTH2,
+    NODE_ROOM,
+    SEARCH_SIZE,
+    START,
+    TOLERANCE,
+    VECTOR,
+    nearest_on_leaf,
+    offer,
+    owner_planes,
+)
+from hhsr.kernels.nearest_part import box_bound, nearest_on_part
+from hhsr.kernels.nearest_slab import nearest_on_slab
+from hhsr.kernels.polygon import ROOM, segment_to_segment
+from hhsr.kernels.tree import (
+    contains_point,
+    into_leaf,
+    into_tree,
+    out_of_tree,
+    owner_of,
+    turn_into_leaf,
+    turn_out_of_leaf,
+)
+
+SIDE = 1e-6  # mm: how far off a plane its two sides are asked
+
+
+@njit(cache=True)
+def near_scratch():
+    """Return (search, local, nodes, keys, corners, spare, rects): what one thread needs for a search."""
+    return (
+        np.empty(SEARCH_SIZE),
+        np.empty(SEARCH_SIZE),
+        np.empty(NODE_ROOM, dtype=np.int64),
+        np.empty(NODE_ROOM),
+        np.empty((ROOM, 3)),
+        np.empty((ROOM, 3)),
+        np.empty((NODE_ROOM, 4)),
+    )
+
+
+@njit(cache=True)
+def set_search(search, px, py, pz, dx, dy, dz, tolerance):
+    """Begin a search about p + t·d."""
+    search[START], search[START + 1], search[START + 2] = px, py, pz
+    search[VECTOR], search[VECTOR + 1], search[VECTOR + 2] = dx, dy, dz
+    search[LENGTH2] = dx * dx + dy * dy + dz * dz
+    search[BEST], search[BEST_T] = np.inf, 0.0
+    search[FOOT], search[FOOT + 1], search[FOOT + 2] = np.nan, np.nan, np.nan
+    search[TOLERANCE] = tolerance
+
+
+@njit(cache=True)
+def _nearest_on_owner(blob, ints, tab, owner, search, local, nodes, keys, corners, spare, rects):
+    o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
+    kind, record = ints[o + OWNER_KIND], ints[o + OWNER_RECORD]
+    planes, count = owner_planes(ints, o)
+    if kind == RETAINED:
+        nearest_on_part(blob, ints, record, planes, count, search, nodes, keys, corners, spare)
+        return
+    if kind != MODEL:
+        nearest_on_slab(blob, ints, record, planes, count, search, nodes, keys, corners, spare, rects)
+        return
+    frame = ints[record + FRAME]
+    qx, qy, qz = into_leaf(blob, ints, record, search[START], search[START + 1], search[START + 2])
+    dx, dy, dz = turn_into_leaf(blob, frame, search[VECTOR], search[VECTOR + 1], search[VECTOR + 2])
+    set_search(local, qx, qy, qz, dx, dy, dz, search[TOLERANCE])
+    local[LENGTH2], local[BEST] = search[LENGTH2], search[BEST]
+    nearest_on_leaf(blob, ints, tab, record, planes, count, local, nodes, keys, corners, spare, rects)
+    if local[BEST] < search[BEST]:
+        x, y, z = turn_out_of_leaf(blob, frame, local[FOOT], local[FOOT + 1], local[FOOT + 2])
+        offer(search, local[BEST], local[BEST_T], x + blob[frame], y + blob[frame + 1], z + blob[frame + 2])
+
+
+@njit(cache=True)
+def _nearest_step(blob, ints, tab, search):
+    """Offer the feet of the segment's ends on the cutting planes where the sides disagree, and the straight edges."""
+    for end in range(2 if search[LENGTH2] > 0.0 else 1):
+        px = search[START] + end * search[VECTOR]
+        py = search[START + 1] + end * search[VECTOR + 1]
+        pz = search[START + 2] + end * search[VECTOR + 2]
+        for k in range(ints[PLANE_COUNT]):
+            o = ints[PLANE_FLOATS] + 4 * k
+            nx, ny, nz = blob[o], blob[o + 1], blob[o + 2]
+            h = nx * px + ny * py + nz * pz - blob[o + 3]
+            if abs(h) < search[BEST]:
+                x, y, z = px - h * nx, py - h * ny, pz - h * nz
+                if contains_point(blob, ints, tab, 0, x + SIDE * nx, y + SIDE * ny, z + SIDE * nz) != contains_point(
+                    blob, ints, tab, 0, x - SIDE * nx, y - SIDE * ny, z - SIDE * nz
+                ):
+                    offer(search, abs(h), float(end), x, y, z)
+    for k in range(ints[EDGE_COUNT]):
+        o = ints[EDGE_FLOATS] + 6 * k
+        ux, uy, uz = blob[o + 3] - blob[o], blob[o + 4] - blob[o + 1], blob[o + 5] - blob[o + 2]
+        d2, t, s = segment_to_segment(
+            search[START],
+            search[START + 1],
+            search[START + 2],
+            search[VECTOR],
+            search[VECTOR + 1],
+            search[VECTOR + 2],
+            blob[o],
+            blob[o + 1],
+            blob[o + 2],
+            ux,
+            uy,
+            uz,
+        )
+        if d2 < search[BEST] * search[BEST]:
+            offer(search, math.sqrt(d2), t, blob[o] + s * ux, blob[o + 1] + s * uy, blob[o + 2] + s * uz)
+
+
+@njit(cache=True)
+def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects):
+    """Find the surface point nearest to the search's segment, to its tolerance: truth ∈ [best − tolerance, best]."""
+    owners = ints[OWNER_COUNT]
+    home = owner_of(blob, ints, 0, search[START], search[START + 1], search[START + 2])
+    _nearest_on_owner(blob, ints, tab, home, search, local, nodes, keys, corners, spare, rects)
+    _nearest_step(blob, ints, tab, search)
+    for owner in range(owners):
+        if owner == home:
+            continue
+        o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
+        box = blob[ints[o + OWNER_BOX] : ints[o + OWNER_BOX] + 6]
+        if box[0] <= box[3] and box_bound(box, search) < search[BEST] - search[TOLERANCE]:
+            _nearest_on_owner(blob, ints, tab, owner, search, local, nodes, keys, corners, spare, rects)
+
+
+@njit(cache=True, nogil=True)
+def nearest_many(blob, points, tolerance, distance, foot):
+    """Fill (n,) signed distance (mm) and (n, 3) nearest surface point of LPS points; NaN where not finite.
+
+    Returns how many are not finite.
+    """
+    ints, tab = integers(blob), tables(blob)
+    search, local, nodes, keys, corners, spare, rects = near_scratch()
+    bad = 0
+    for i in range(points.shape[0]):
+        if not (math.isfinite(points[i, 0]) and math.isfinite(points[i, 1]) and math.isfinite(points[i, 2])):
+            distance[i] = np.nan
+            foot[i, 0], foot[i, 1], foot[i, 2] = np.nan, np.nan, np.nan
+            bad += 1
+            continue
+        x, y, z = into_tree(blob, ints, points[i, 0], points[i, 1], points[i, 2])
+        set_search(search, x, y, z, 0.0, 0.0, 0.0, tolerance)
+        search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+        distance[i] = -search[BEST] if contains_point(blob, ints, tab, 0, x, y, z) else search[BEST]
+        foot[i, 0], foot[i, 1], foot[i, 2] = out_of_tree(blob, ints, search[FOOT], search[FOOT + 1], search[FOOT + 2])
+    return bad
+
+
+@njit(cache=True)
+def _highest(px, py, pz, dx, dy, dz, t0, t1, ax, ay, az, bx, by, bz):
+    """Return (value², t) of the greatest of min(|p(t) − a|, |p(t) − b|)² on [t0, t1]: an upper bound of the distance."""
+    dd = dx * dx + dy * dy + dz * dz
+    c0 = (px - ax) ** 2 + (py - ay) ** 2 + (pz - az) ** 2
+    c1 = 2.0 * (dx * (px - ax) + dy * (py - ay) + dz * (pz - az))
+    e0 = (px - bx) ** 2 + (py - by) ** 2 + (pz - bz) ** 2
+    e1 = 2.0 * (dx * (px - bx) + dy * (py - by) + dz * (pz - bz))
+    best, where = -1.0, t0
+    for k in range(3):
+        if k == 0:
+            t = t0
+        elif k == 1:
+            t = t1
+        else:
+            if c1 == e1:
+                continue
+            t = (e0 - c0) / (c1 - e1)
+            if not t0 < t < t1:
+                continue
+        value = min(c0 + t * (c1 + t * dd), e0 + t * (e1 + t * dd))
+        if value > best:
+            best, where = value, t
+    return best, where
+
+
+@njit(cache=True)
+def deepest(
+    blob, ints, tab, px, py, pz, dx, dy, dz, t0, t1, tolerance, floor, out,
+    search, local, nodes, keys, corners, spare, rects, spans,
+):  # fmt: skip
+    """Return an upper bound, at most `tolerance` above the truth, of the depth on [t0, t1] where p + t·d is inside.
+
+    A nearest surface point found at one t bounds the depth at every other by its distance: intervals between two such
+    points are parted at their highest bound, until it exceeds the depth found by no more than the tolerance. `floor`:
+    a depth already known; no more than that need be proven below it. out: best t and foot (4,).
+    """
+    inner = 0.25 * tolerance
+    best = floor
+    spans_used = 1
+    for k in range(2):
+        t = t0 if k == 0 else t1
+        set_search(search, px + t * dx, py + t * dy, pz + t * dz, 0.0, 0.0, 0.0, inner)
+        search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+        o = 0 if k == 0 else 4
+        spans[0, o] = t
+        spans[0, o + 1], spans[0, o + 2], spans[0, o + 3] = search[FOOT], search[FOOT + 1], search[FOOT + 2]
+        if search[BEST] > best:
+            best = search[BEST]
+            out[0], out[1], out[2], out[3] = t, search[FOOT], search[FOOT + 1], search[FOOT + 2]
+    high = best
+    while spans_used > 0:
+        spans_used -= 1
+        s = spans_used
+        a, ax, ay, az = spans[s, 0], spans[s, 1], spans[s, 2], spans[s, 3]
+        b, bx, by, bz = spans[s, 4], spans[s, 5], spans[s, 6], spans[s, 7]
+        value2, t = _highest(px, py, pz, dx, dy, dz, a, b, ax, ay, az, bx, by, bz)
+        value = math.sqrt(value2)
+        if value <= best + tolerance or s + 2 > spans.shape[0] or not a < t < b:
+            high = max(high, value)
+            continue
+        set_search(search, px + t * dx, py + t * dy, pz + t * dz, 0.0, 0.0, 0.0, inner)
+        search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+        x, y, z = search[FOOT], search[FOOT + 1], search[FOOT + 2]
+        if search[BEST] > best:
+            best = search[BEST]
+            out[0], out[1], out[2], out[3] = t, x, y, z
+        spans[s, 4], spans[s, 5], spans[s, 6], spans[s, 7] = t, x, y, z
+        spans[s + 1, 0], spans[s + 1, 1], spans[s + 1, 2], spans[s + 1, 3] = t, x, y, z
+        spans[s + 1, 4], spans[s + 1, 5], spans[s + 1, 6], spans[s + 1, 7] = b, bx, by, bz
+        spans_used += 2
+    return high
+
+
+@njit(cache=True, nogil=True)
+def clearance_many(blob, starts, ends, tolerance, value, t, foot):
+    """Fill (n,) clearance of the axes of LPS segments (no radius), (n,) where along it, (n, 3) the surface point there.
+
+    truth − tolerance ≤ value ≤ truth; NaN where not finite. Returns how many are not finite.
+    """
+    ints, tab = integers(blob), tables(blob)
+    search, local, nodes, keys, corners, spare, rects = near_scratch()
+    work, slots, pending = scratch()
+    ts, out, spans = np.empty(512), np.empty(4), np.empty((256, 8))
+    bad = 0
+    for i in range(starts.shape[0]):
+        ok = True
+        for k in range(3):
+            ok = ok and math.isfinite(starts[i, k]) and math.isfinite(ends[i, k])
+        if not ok:
+            value[i], t[i] = np.nan, np.nan
+            foot[i, 0], foot[i, 1], foot[i, 2] = np.nan, np.nan, np.nan
+            bad += 1
+            continue
+        px, py, pz = into_tree(blob, ints, starts[i, 0], starts[i, 1], starts[i, 2])
+        ex, ey, ez = into_tree(blob, ints, ends[i, 0], ends[i, 1], ends[i, 2])
+        dx, dy, dz = ex - px, ey - py, ez - pz
+        inside, count = follow_segment(
+            blob,
+            ints,
+            tab,
+            0,
+            px,
+            py,
+            pz,
+            ex,
+            ey,
+            ez,
+            0.1 * tolerance,
+            0.1 * tolerance,
+            False,
+            ts,
+            work,
+            slots,
+            pending,
+        )
+        if not inside and count == 0:
+            set_search(search, px, py, pz, dx, dy, dz, tolerance)
+            search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+            value[i], t[i] = search[BEST] - tolerance, search[BEST_T]
+            foot[i, 0], foot[i, 1], foot[i, 2] = out_of_tree(
+                blob, ints, search[FOOT], search[FOOT + 1], search[FOOT + 2]
+            )
+            continue
+        deep, begin = 0.0, 0.0
+        out[0], out[1], out[2], out[3] = 0.0, np.nan, np.nan, np.nan
+        for k in range(min(count, ts.shape[0]) + 1):
+            end = ts[k] if k < count else 1.0
+            if inside and end >= begin:
+                deep = max(
+                    deep,
+                    deepest(blob, ints, tab, px, py, pz, dx, dy, dz, begin, end, 0.7 * tolerance, deep, out, search,
+                            local, nodes, keys, corners, spare, rects, spans),
+                )  # fmt: skip
+            inside, begin = not inside, end
+        value[i], t[i] = -deep - 0.1 * tolerance, out[0]
+        foot[i, 0], foot[i, 1], foot[i, 2] = out_of_tree(blob, ints, out[1], out[2], out[3])
+    return bad

@@ -1,0 +1,80 @@
+"""The box of an owner's surface within its region, in any rotated frame."""
+
+import numpy as np
+from numba import njit
+
+from hhsr.kernels.cell import direction_of
+from hhsr.kernels.layout import (
+    CELL_SIZE,
+    CELL_TABLE,
+    CELLS,
+    ERROR,
+    SLOPE_A,
+    SLOPE_B,
+    VALUE,
+    integers,
+    tables,
+)
+from hhsr.kernels.maps import model_thickness, quad_radius_ok
+from hhsr.kernels.part import TRIANGLES, part_arrays
+from hhsr.kernels.polygon import ROOM, clip_polygon
+
+
+@njit(cache=True)
+def _add(box, rotation, x, y, z, grow):
+    for k in range(3):
+        v = rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2] * z
+        box[k], box[3 + k] = min(box[k], v - grow), max(box[3 + k], v + grow)
+
+
+@njit(cache=True, nogil=True)
+def leaf_box(blob, leaf, planes, count, rotation, box):
+    """Fill (6,) lowest and highest corner of R·(surface of a model leaf within its region); lowest > highest: empty."""
+    ints, tab = integers(blob), tables(blob)
+    corners, spare = np.empty((ROOM, 3)), np.empty((ROOM, 3))
+    box[:3], box[3:] = np.inf, -np.inf
+    n = ints[leaf + CELLS]
+    half = 1.0 / n
+    for face in range(6):
+        for i in range(n):
+            for j in range(n):
+                o = ints[leaf + CELL_TABLE] + CELL_SIZE * ((face * n + i) * n + j)
+                a, b = (2 * i + 1) / n - 1.0, (2 * j + 1) / n - 1.0
+                value, ga, gb, error = tab[o + VALUE], tab[o + SLOPE_A], tab[o + SLOPE_B], tab[o + ERROR]
+                if quad_radius_ok(value, ga, gb, error, half, half):
+                    thick = model_thickness(face, a, b, half, half, value, ga, gb, error)
+                else:  # a steep cell: twice its middle radius is a safe overestimate of nothing; take its range
+                    ga, gb, thick = 0.0, 0.0, 0.0
+                    low = max(value - (abs(tab[o + SLOPE_A]) + abs(tab[o + SLOPE_B])) * half - error, 0.05 * value)
+                    thick = 1.7320508075688772 * (1.0 / low - 1.0 / value)
+                for corner in range(4):
+                    da = half if corner == 1 or corner == 2 else -half
+                    db = half if corner >= 2 else -half
+                    x, y, z = direction_of(face, a + da, b + db)
+                    m = 1.0 / (value + ga * da + gb * db)
+                    corners[corner, 0], corners[corner, 1], corners[corner, 2] = x * m, y * m, z * m
+                size = 4
+                for k in range(count):
+                    q = planes + 4 * k
+                    size = clip_polygon(corners, size, spare, blob[q], blob[q + 1], blob[q + 2], blob[q + 3] + thick)
+                for k in range(size):
+                    _add(box, rotation, corners[k, 0], corners[k, 1], corners[k, 2], thick)
+
+
+@njit(cache=True, nogil=True)
+def part_box(blob, part, planes, count, rotation, box):
+    """Fill (6,) the same of a retained part's triangles within its region."""
+    ints = integers(blob)
+    corners, spare = np.empty((ROOM, 3)), np.empty((ROOM, 3))
+    box[:3], box[3:] = np.inf, -np.inf
+    if ints[part + TRIANGLES] == 0:
+        return
+    _, _, triangles = part_arrays(blob, ints, part)
+    for i in range(triangles.shape[0]):
+        corners[:3] = triangles[i]
+        size = 3
+        for k in range(count):
+            q = planes + 4 * k
+            size = clip_polygon(corners, size, spare, blob[q], blob[q + 1], blob[q + 2], blob[q + 3])
+        for k in range(size):
+            _add(box, rotation, corners[k, 0], corners[k, 1], corners[k, 2], 0.0)

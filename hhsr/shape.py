@@ -1,0 +1,388 @@
+"""Shape: what a user asks of a fitted organ. Points in LPS mm, (..., 3) in, (...) out; distances < 0 inside."""
+
+from __future__ import annotations
+
+import builtins
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from hhsr import io
+from hhsr.batches import in_parts
+from hhsr.check import as_float, as_points, as_rigid, require_finite
+from hhsr.compiled import Compiled, compile_tree
+from hhsr.errors import FileFormatError, InputError
+from hhsr.kernels import crossing as crossing_kernels
+from hhsr.kernels import distance as distance_kernels
+from hhsr.kernels import tree as tree_kernels
+from hhsr.model import ErrorFigures, FloatArray, IntArray, Provenance, Tree, rotation_matrix
+from hhsr.surface import reconstruct
+
+if TYPE_CHECKING:
+    import trimesh
+
+OnInvalid = Literal["raise", "mark"]
+
+RESOLUTION_MM = 0.01
+CROSSING_TOLERANCE_MM = 0.001
+TOLERANCE_MM = 0.01
+
+
+class Crossings(NamedTuple):
+    """Where segments cross a shape's surface; segment i has rows offsets[i] … offsets[i + 1], in order.
+
+    offsets: (n + 1,). t: (m,) share of the segment, in [0, 1]. points: (m, 3) LPS mm. entering: (m,) bool.
+    valid: (n,) bool, False where a segment was not finite (asked with on_invalid="mark").
+    """
+
+    offsets: IntArray
+    t: FloatArray
+    points: FloatArray
+    entering: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
+
+
+class Clearance(NamedTuple):
+    """Clearance of capsules, with the closest pair.
+
+    clearance: (...) mm. t: (...) share of the segment where the axis is nearest (deepest, where it enters).
+    on_axis, on_surface: (..., 3) the pair of points, LPS mm.
+    """
+
+    clearance: FloatArray
+    t: FloatArray
+    on_axis: FloatArray
+    on_surface: FloatArray
+
+
+class Shape:
+    """A fitted shape: a tree of small records, and every question about the solid that it means (DESIGN §2).
+
+    Parameters
+    ----------
+    tree : the records and their pose
+    provenance : where it comes from and how well it fits
+    report : how the fit went, JSON values; by default the provenance's
+    """
+
+    def __init__(
+        self, tree: Tree, provenance: Provenance | None = None, report: Mapping[str, Any] | None = None
+    ) -> None:
+        self.tree = tree
+        self.provenance = provenance if provenance is not None else Provenance()
+        self.report: dict[str, Any] = dict(report if report is not None else self.provenance.report)
+
+    @cached_property
+    def compiled(self) -> Compiled:
+        """The tree laid out for the kernels; made on the first query, or by `warm_up`."""
+        return compile_tree(self.tree)
+
+    @cached_property
+    def _blob(self) -> FloatArray:
+        return self.compiled.blob
+
+    def warm_up(self) -> Shape:
+        """Compile the tree and the kernels now, so that no later query waits; return the shape."""
+        at = np.zeros((1, 3))
+        self.contains(at[0])
+        self.contains(at)
+        self.closest_point(at)
+        self.crossings(at, at + 1.0)
+        self.first_crossing(at, at + 1.0)
+        self.clearance(at, at + 1.0)
+        return self
+
+    # -- what it is ---------------------------------------------------------------------------------------------------
+
+    @property
+    def parameters(self) -> int:
+        """How many numbers the shape is made of (the counting rule of `hhsr.model`)."""
+        return self.tree.parameters
+
+    @cached_property
+    def encoded(self) -> builtins.bytes:
+        """The content of the shape's file."""
+        return io.encode(self.tree, self.provenance)
+
+    @property
+    def bytes(self) -> int:
+        """Size of the shape's file."""
+        return len(self.encoded)
+
+    @property
+    def fit_error(self) -> ErrorFigures | None:
+        """Two-sided true distance to the source, mm: mean, 95th percentile, sampled maximum; None where not measured."""
+        return self.provenance.fit_error
+
+    @property
+    def leaf_errors(self) -> tuple[ErrorFigures, ...]:
+        """The same for each leaf, left to right."""
+        return self.provenance.leaf_errors
+
+    @property
+    def bounds(self) -> FloatArray:
+        """(2, 3) lowest and highest corner of the solid's box, LPS mm; NaN for an empty solid."""
+        return self.compiled.bounds
+
+    def mesh(self, tolerance_mm: float = 0.02) -> trimesh.Trimesh:
+        """Return the surface as a closed mesh, LPS mm, no farther than the tolerance from it."""
+        return reconstruct(self.tree, as_float(tolerance_mm, "tolerance_mm", 1e-4, 1e3))
+
+    def moved(self, T_target_source: ArrayLike) -> Shape:
+        """Return the shape after a rigid motion (4, 4), mm: nothing is fitted or proven again."""
+        motion = as_rigid(T_target_source)
+        pose = np.empty(6)
+        pose[:3] = Rotation.from_matrix(motion[:3, :3] @ rotation_matrix(self.tree.pose[:3])).as_rotvec()
+        pose[3:] = motion[:3, :3] @ self.tree.pose[3:] + motion[:3, 3]
+        pose.setflags(write=False)
+        shape = Shape(Tree(self.tree.root, pose), self.provenance, self.report)
+        if "compiled" in self.__dict__:
+            shape.__dict__["compiled"] = self.compiled.moved(pose)
+        return shape
+
+    def save(self, path: str | Path) -> None:
+        """Write the shape to a .hhsr file."""
+        Path(path).write_bytes(self.encoded)
+
+    # -- where a point is ---------------------------------------------------------------------------------------------
+
+    def contains(self, points: ArrayLike, on_invalid: OnInvalid = "raise") -> Any:
+        """Return (...) bool, whether the solid holds points (..., 3) mm; on the surface is inside.
+
+        on_invalid="mark": int8 instead, 1 inside, 0 outside, −1 where a point is not finite (else that is InputError).
+        """
+        if type(points) is np.ndarray and points.shape == (3,) and points.dtype == np.float64:
+            code = tree_kernels.contains_one(self._blob, points)
+            if code >= 0 and on_invalid == "raise":
+                return code == 1
+        array, mark = as_points(points), _marks(on_invalid)
+        flat = array.reshape(-1, 3)
+        out = np.empty(len(flat), dtype=np.int8)
+        blob = self._blob
+        bad = sum(in_parts(len(flat), 20_000, lambda i, j: tree_kernels.contains_many(blob, flat[i:j], out[i:j])))
+        if bad and not mark:
+            require_finite(array, "points")
+        result = out.reshape(array.shape[:-1])
+        return _scalar(result if mark else result == 1)
+
+    def field(self, points: ArrayLike, on_invalid: OnInvalid = "raise") -> Any:
+        """Return (...) the implicit value at points (..., 3): ≤ 0 inside; no distance, and it jumps across step faces.
+
+        G of Eq. 3 in a leaf's region, (|p∥ − c| − r)/r of the nearest lobe in a slab, signed distance over extent in a
+        retained part's.
+        """
+        array, mark = as_points(points), _marks(on_invalid)
+        flat = array.reshape(-1, 3)
+        out = np.empty(len(flat))
+        blob = self._blob
+        bad = sum(in_parts(len(flat), 10_000, lambda i, j: tree_kernels.field_many(blob, flat[i:j], out[i:j])))
+        if bad and not mark:
+            require_finite(array, "points")
+        return _scalar(out.reshape(array.shape[:-1]))
+
+    def signed_distance(
+        self, points: ArrayLike, on_invalid: OnInvalid = "raise", tolerance_mm: float = TOLERANCE_MM
+    ) -> Any:
+        """Return (...) mm to the surface at points (..., 3), < 0 inside, within the tolerance of the truth.
+
+        NaN where a point is not finite, with on_invalid="mark"; +inf for an empty solid.
+        """
+        return self._nearest(points, on_invalid, tolerance_mm)[1]
+
+    def closest_point(
+        self, points: ArrayLike, on_invalid: OnInvalid = "raise", tolerance_mm: float = TOLERANCE_MM
+    ) -> tuple[FloatArray, Any]:
+        """Return (..., 3) a surface point nearest to points (..., 3), to the tolerance, and (...) signed distance mm."""
+        return self._nearest(points, on_invalid, tolerance_mm)
+
+    def _nearest(self, points: ArrayLike, on_invalid: OnInvalid, tolerance_mm: float) -> tuple[FloatArray, Any]:
+        array, mark = as_points(points), _marks(on_invalid)
+        tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-6, 1e3)
+        flat = array.reshape(-1, 3)
+        distance, foot = np.empty(len(flat)), np.empty((len(flat), 3))
+        blob = self._blob
+        bad = sum(
+            in_parts(
+                len(flat),
+                1_000,
+                lambda i, j: distance_kernels.nearest_many(blob, flat[i:j], tolerance, distance[i:j], foot[i:j]),
+            )
+        )
+        if bad and not mark:
+            require_finite(array, "points")
+        return foot.reshape(array.shape), _scalar(distance.reshape(array.shape[:-1]))
+
+    # -- what a segment meets -----------------------------------------------------------------------------------------
+
+    def crossings(
+        self,
+        starts: ArrayLike,
+        ends: ArrayLike,
+        on_invalid: OnInvalid = "raise",
+        resolution_mm: float = RESOLUTION_MM,
+        tolerance_mm: float = CROSSING_TOLERANCE_MM,
+    ) -> Crossings:
+        """Return all crossings of segments (n, 3) → (n, 3) with the surface, in order; or of one segment (3,) → (3,).
+
+        Nothing thicker than the resolution is missed; places are right to the tolerance. Between two outside points the
+        number is even. A segment of no length has no crossings.
+        """
+        first, last, _ = _segments(starts, ends)
+        resolution = as_float(resolution_mm, "resolution_mm", 1e-6, 1e3)
+        tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-9, 1e3)
+        counts, begins = np.empty(len(first), dtype=np.int64), np.empty(len(first), dtype=np.bool_)
+        blob = self._blob
+
+        def part(i: int, j: int) -> FloatArray:
+            found: list[FloatArray] = []
+            room = 4 * (j - i) + 64
+            while True:
+                t = np.empty(room)
+                done, used = crossing_kernels.cross_many(
+                    blob, first[i:j], last[i:j], resolution, tolerance, counts[i:j], begins[i:j], t
+                )
+                found.append(t[:used])
+                i += done
+                if i == j:
+                    return np.concatenate(found)
+                if done == 0:
+                    room *= 4
+
+        t = np.concatenate(in_parts(len(first), 4_000, part)) if len(first) else np.empty(0)
+        valid = counts >= 0
+        if not valid.all():
+            if not _marks(on_invalid):
+                require_finite(first, "starts")
+                require_finite(last, "ends")
+            counts = np.where(valid, counts, 0)
+        offsets = np.concatenate([[0], np.cumsum(counts)])
+        row = np.repeat(np.arange(len(first)), counts)
+        order = np.arange(len(t)) - offsets[row]
+        entering = (order % 2 == 0) != begins[row]
+        points = first[row] + t[:, None] * (last[row] - first[row])
+        return Crossings(offsets, t, points, entering, valid)
+
+    def first_crossing(
+        self,
+        starts: ArrayLike,
+        ends: ArrayLike,
+        on_invalid: OnInvalid = "raise",
+        resolution_mm: float = RESOLUTION_MM,
+        tolerance_mm: float = CROSSING_TOLERANCE_MM,
+    ) -> Any:
+        """Return (...) t in [0, 1] of the first crossing of segments (..., 3) → (..., 3), NaN where there is none.
+
+        With on_invalid="mark": (t, valid), valid (...) False where a segment is not finite.
+        """
+        first, last, shape = _segments(starts, ends)
+        mark = _marks(on_invalid)
+        resolution = as_float(resolution_mm, "resolution_mm", 1e-6, 1e3)
+        tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-9, 1e3)
+        out = np.empty(len(first))
+        blob = self._blob
+        bad = sum(
+            in_parts(
+                len(first),
+                4_000,
+                lambda i, j: crossing_kernels.first_many(blob, first[i:j], last[i:j], resolution, tolerance, out[i:j]),
+            )
+        )
+        if bad and not mark:
+            require_finite(first, "starts")
+            require_finite(last, "ends")
+        valid = out != -1.0
+        out[~valid] = np.nan
+        if mark:
+            return _scalar(out.reshape(shape)), _scalar(valid.reshape(shape))
+        return _scalar(out.reshape(shape))
+
+    def clearance(
+        self,
+        starts: ArrayLike,
+        ends: ArrayLike,
+        radius: float = 0.0,
+        on_invalid: OnInvalid = "raise",
+        tolerance_mm: float = TOLERANCE_MM,
+    ) -> Any:
+        """Return (...) mm between capsules (segments (..., 3) → (..., 3) of a radius) and the solid, < 0 where they touch.
+
+        min over the segment of signed_distance − radius: −(greatest depth) − radius where the axis enters. Never above
+        the truth, at most the tolerance below it. NaN where not finite, with on_invalid="mark".
+        """
+        return self.closest_approach(starts, ends, radius, on_invalid, tolerance_mm).clearance
+
+    def closest_approach(
+        self,
+        starts: ArrayLike,
+        ends: ArrayLike,
+        radius: float = 0.0,
+        on_invalid: OnInvalid = "raise",
+        tolerance_mm: float = TOLERANCE_MM,
+    ) -> Clearance:
+        """Return `clearance` with the closest pair of points and where along the segment it lies."""
+        first, last, shape = _segments(starts, ends)
+        mark = _marks(on_invalid)
+        thick = as_float(radius, "radius", 0.0)
+        tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-4, 1e3)
+        value, t, foot = np.empty(len(first)), np.empty(len(first)), np.empty((len(first), 3))
+        blob = self._blob
+        bad = sum(
+            in_parts(
+                len(first),
+                500,
+                lambda i, j: distance_kernels.clearance_many(
+                    blob, first[i:j], last[i:j], tolerance, value[i:j], t[i:j], foot[i:j]
+                ),
+            )
+        )
+        if bad and not mark:
+            require_finite(first, "starts")
+            require_finite(last, "ends")
+        axis = first + t[:, None] * (last - first)
+        return Clearance(
+            _scalar((value - thick).reshape(shape)),
+            _scalar(t.reshape(shape)),
+            axis.reshape(*shape, 3),
+            foot.reshape(*shape, 3),
+        )
+
+
+def load(path: str | Path) -> Shape:
+    """Return the shape in a .hhsr file; raise FileFormatError where it is none, or damaged."""
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise FileFormatError(f"{path}: cannot be read ({error.strerror}), expected a .hhsr file") from error
+    return Shape(*io.decode(content))
+
+
+def _marks(on_invalid: str) -> bool:
+    if on_invalid not in ("raise", "mark"):
+        raise InputError(f'on_invalid: got {on_invalid!r}, expected "raise" or "mark"')
+    return on_invalid == "mark"
+
+
+def _scalar(array: NDArray[Any]) -> Any:
+    """Return a Python scalar for a 0-d array: one point in, one answer out."""
+    return array.item() if array.ndim == 0 else array
+
+
+def _segments(starts: ArrayLike, ends: ArrayLike) -> tuple[FloatArray, FloatArray, tuple[int, ...]]:
+    first, last = as_points(starts, "starts"), as_points(ends, "ends")
+    if first.shape != last.shape:
+        try:
+            first, last = np.broadcast_arrays(first, last)
+        except ValueError as error:
+            raise InputError(
+                f"starts and ends: got shapes {first.shape} and {last.shape}, expected one end for each start"
+            ) from error
+        first, last = np.ascontiguousarray(first), np.ascontiguousarray(last)
+    return first.reshape(-1, 3), last.reshape(-1, 3), first.shape[:-1]
+
+
+__all__ = ["Clearance", "Crossings", "Shape", "load"]
