@@ -11,6 +11,9 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from guidance.track import track
+from guidance.tracker_emulator import tracker_emulator
+
 if TYPE_CHECKING:
     from guidance.scene import Scene
     from guidance.session import Session
@@ -118,3 +121,7 @@ def _summary(session: Session) -> list[str]:
             lines.append(f"{outcome.name} insertion: {warned} contact with {escape(w.structure)} ({stated})")
     lines.append(f"results in [bold]{escape(str(session.folder))}[/]: plan.json, events.jsonl, picture.png, *.hhsr")
     return lines
+
+
+app.command("track")(track)
+app.command("tracker-emulator")(tracker_emulator)

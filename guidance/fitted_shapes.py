@@ -86,6 +86,7 @@ def _shape(source: ShapeSource, folder: Path) -> Shape:
         raise SceneError(f"structure {source.name!r} ({source.file.name}): {error}") from error
     with contextlib.suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
+        (folder / ".gitignore").write_text("*\n", encoding="utf-8")
         shape.save(kept)
     return shape
 

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 Table = Mapping[str, Any]
 
+_USUAL_PARAMETERS = 600  # of a fit where the scene does not say: an organ to about half a millimetre
+
 _KEYS = {
     "": {"name", "needle", "errors", "target", "entry", "structure"},
     "needle": {"length_mm", "radius_mm"},
@@ -107,7 +109,7 @@ def _source(table: Table, folder: Path) -> ShapeSource:
         frame=_text(table, "frame", where),
         unit=_text(table, "unit", where),
         label=label,
-        max_parameters=parameters,
+        max_parameters=parameters if parameters is not None or table.get("retain") else _USUAL_PARAMETERS,
         retain=bool(table.get("retain", False)),
         force=bool(table.get("force", False)),
     )
