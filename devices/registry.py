@@ -124,7 +124,7 @@ def _open_ndi(url: str, place: str, parameters: Parameters, clock: Clock | None)
 
     roms, names = parameters.pop("rom", []), parameters.pop("name", [])
     readers: dict[str, Callable[[str], Any]] = {"baud_rate": int, "mode": str, "latency_s": float}
-    readers |= {"wired": _flag, "markers": _flag, "strays": _flag, "reply_timeout_s": float}
+    readers |= {"wired": _flag, "markers": _flag, "strays": _flag, "reply_timeout_s": float, "command_timeout_s": float}
     return NdiTracker(place, roms=roms, names=names, clock=clock, **_taken(url, parameters, readers))
 
 

@@ -32,6 +32,8 @@ _ANY_TIME = {"INIT", "RESET", "COMM", "VER", "ECHO", "APIREV", "BEEP", "GET", "G
 _NOT_TRACKING = {"INIT", "COMM", "PHSR", "PHRQ", "PVWR", "PVCLR", "PINIT", "PENA", "PDIS", "PHF", "PHINF", "TSTART"}
 _NOT_TRACKING |= {"SSTAT", "VSEL", "DSTART", "DSTOP", "SFLIST", "VER"}
 _LONGEST_COMMAND = 4096
+#: a tool was plugged in or pulled out; told until the host asks which
+_PORTS_CHANGED = 0xC0
 
 
 class Device:
@@ -166,6 +168,8 @@ class Device:
             if self.tracking and name in _NOT_TRACKING:
                 raise Refused(0x0C)
             reply = method(self, arguments) if method else _PORT_COMMANDS[name](self.ports, arguments)
+            if name == "PHSR":
+                self.system_status &= ~_PORTS_CHANGED
         except Refused as refused:
             reply = f"ERROR{refused.code:02X}"
         return reply if isinstance(reply, bytes) else text_reply(reply)

@@ -17,10 +17,12 @@ __all__ = ["Interrupted", "Session", "SilentLine"]
 
 #: speeds in the order in which they are tried, with the digit that COMM wants
 SPEEDS = {921600: "6", 230400: "A", 115200: "5", 57600: "4", 38400: "3", 19200: "2"}
+_SLOW = ("INIT", "PINIT", "TSTART")
 _SLICE_S = 0.05
 _RESET_S = 7.0
 _BREAK_S = 1.0
 _NOT_ALLOWED_NOW = 0x0C
+_NOT_ALLOCATED = 0x2B
 
 
 class SilentLine(TransportError):
@@ -41,23 +43,25 @@ class Session:
         Told of bad checksums, bad replies and missing ones.
     interrupt : Event
         Set by `Tracker.stop`; ends every wait within 50 ms.
+    patience_s : float
+        How long a command may take that does not say otherwise; INIT, PINIT and TSTART get 2.5 times as long.
     """
 
-    def __init__(self, line: Line, counters: LineCounters, interrupt: Event) -> None:
-        self.line, self.counters, self._interrupt = line, counters, interrupt
+    def __init__(self, line: Line, counters: LineCounters, interrupt: Event, patience_s: float = 2.0) -> None:
+        self.line, self.counters, self._interrupt, self._patience_s = line, counters, interrupt, patience_s
         self._reader = ReplyReader()
         self.speed = 9600
 
     # asking
 
-    def ask(self, name: str, arguments: str = "", timeout_s: float = 2.0, closing: bool = False) -> str | bytes:
+    def ask(self, name: str, arguments: str = "", timeout_s: float | None = None, closing: bool = False) -> str | bytes:
         """Send a command and return its reply: text, or the body of a binary reply.
 
         Parameters
         ----------
         name, arguments : str
-        timeout_s : float
-            Longest wait for the whole reply, s.
+        timeout_s : float or None
+            Longest wait for the whole reply, s; the session's patience by default.
         closing : bool
             Whether an interrupt is to be ignored: the last words of a session.
 
@@ -71,6 +75,8 @@ class Session:
             Where nothing came in time, or the line is lost, or the device says that it was reset.
         """
         asked = f"{name}:{arguments}" if len(arguments) <= 24 else f"{name}:{arguments[:24]}…"
+        if timeout_s is None:
+            timeout_s = self._patience_s * (2.5 if name in _SLOW else 1.0)
         self._reader.clear()
         self.line.drop_input()
         self.line.write(command(name, arguments))
@@ -105,26 +111,42 @@ class Session:
                 break
         self._reader.clear()
 
-    def ask_text(self, name: str, arguments: str = "", timeout_s: float = 2.0, tries: int = 3) -> str:
-        """Ask for text; damaged and missing replies are asked for again. Only for commands that may be repeated."""
+    def ask_text(self, name: str, arguments: str = "", done: int | None = None) -> str:
+        """Ask for text; damaged and missing replies are asked for again, up to three times in all.
+
+        `done` is the error code by which a device refuses to do again what it has done: after a reply that was lost,
+        it says OKAY.
+        """
         failure: ProtocolError | SilentLine | None = None
-        for _ in range(tries):
+        for _ in range(3):
             try:
-                reply = self.ask(name, arguments, timeout_s)
+                reply = self.ask(name, arguments)
             except (ProtocolError, SilentLine) as error:
                 failure = error
                 continue
+            except TrackerError as error:
+                if failure is not None and error.code == done:
+                    return "OKAY"
+                raise
             if isinstance(reply, str):
                 return reply
             failure = ProtocolError(f"{name}: expected text, got {len(reply)} bytes")
         assert failure is not None
         raise failure
 
-    def order(self, name: str, arguments: str = "", timeout_s: float = 2.0) -> None:
-        """Ask for something to be done that may be done twice."""
-        reply = self.ask_text(name, arguments, timeout_s)
+    def order(self, name: str, arguments: str = "", done: int | None = None) -> None:
+        """Ask for something to be done; `done` as in `ask_text`."""
+        reply = self.ask_text(name, arguments, done)
         if reply != "OKAY" and not reply.startswith("WARNING"):
             raise ProtocolError(f"{name}:{arguments[:24]}: expected OKAY, got {reply[:60]!r}")
+
+    def start_tracking(self) -> None:
+        """Start tracking."""
+        self.order("TSTART", done=_NOT_ALLOWED_NOW)
+
+    def stop_tracking(self) -> None:
+        """Stop tracking, to go on with something else."""
+        self.order("TSTOP", done=_NOT_ALLOWED_NOW)
 
     # waking
 
@@ -144,7 +166,7 @@ class Session:
         except TrackerError as error:
             if error.code != _NOT_ALLOWED_NOW:
                 raise
-            self.order("TSTOP")
+            self.stop_tracking()
             self.order("INIT")
 
     def reset(self) -> None:
@@ -239,7 +261,7 @@ class Session:
             raise ProtocolError(f"PHRQ: expected a handle, got {reply[:20]!r}")
         for address, piece in definition.chunks:
             self.order("PVWR", f"{reply}{address:04X}{piece.hex().upper()}")
-        self.order("PINIT", reply, 5.0)
+        self.order("PINIT", reply)
         self.order("PENA", f"{reply}D")
         return int(reply, 16)
 
@@ -250,7 +272,7 @@ class Session:
         A tool that cannot be initialised is left out.
         """
         for handle, _ in decode_handles(self.ask_text("PHSR", "01")):
-            self.order("PHF", f"{handle:02X}")
+            self.order("PHF", f"{handle:02X}", done=_NOT_ALLOCATED)
         found: dict[int, str] = {}
         failed: set[int] = set()
         for _ in range(8):
@@ -259,7 +281,7 @@ class Session:
                 break
             for handle in waiting:
                 try:
-                    self.order("PINIT", f"{handle:02X}", 5.0)
+                    self.order("PINIT", f"{handle:02X}")
                 except TrackerError:
                     failed.add(handle)
         for handle, _ in decode_handles(self.ask_text("PHSR", "03")):

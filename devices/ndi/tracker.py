@@ -32,6 +32,9 @@ _UNKNOWN_COMMAND = 0x01
 _PORT_OCCUPIED = 0x40
 #: a tool whose own frame number is farther behind the newest is old data
 _STALE_FRAMES = 6
+_PLUG_AGAIN_S = 2.0
+#: a line that says nothing for so long, s, and twice in a row, is lost
+_SILENT_S = 0.75
 _WRAP = 1 << 32
 
 
@@ -52,7 +55,7 @@ class NdiTracker(Tracker):
 
     `start` wakes the device from any state, agrees on a speed, loads and enables the tools, and starts tracking;
     `read` asks for poses until a new frame is there; `stop` ends tracking and leaves the device at 9600 baud. Damaged
-    replies are counted, dropped and asked for again. After two answers missing in a row, or where the line is lost,
+    replies are counted, dropped and asked for again. After 0.8 s without an answer, or where the line is lost,
     `read` raises `TransportError`; the next `read` starts afresh.
 
     Parameters
@@ -73,8 +76,8 @@ class NdiTracker(Tracker):
         Whether to ask for the tools' single markers and for markers that belong to none.
     latency_s : float
         From measurement to the reply: what arrivals are set back by.
-    reply_timeout_s : float
-        How long a tracking reply may take.
+    reply_timeout_s, command_timeout_s : float
+        How long a tracking reply may take, and any other (INIT, PINIT and TSTART 2.5 times as long).
     clock : Clock or None
 
     Raises
@@ -95,6 +98,7 @@ class NdiTracker(Tracker):
         strays: bool = False,
         latency_s: float = 0.0,
         reply_timeout_s: float = 0.4,
+        command_timeout_s: float = 2.0,
         clock: Clock | None = None,
     ) -> None:
         super().__init__(clock)
@@ -118,7 +122,7 @@ class NdiTracker(Tracker):
         self._options |= Option.STRAYS if strays else Option(0)
         self.latency_s, self._reply_timeout_s = latency_s, reply_timeout_s
         self._lock = threading.RLock()
-        self._session = Session(self.line, self.counters, self._stopping)
+        self._session = Session(self.line, self.counters, self._stopping, command_timeout_s)
         self._tools: dict[int, str] = {}
         self._tracking = False
         self._silent = self._refused = self._behind = 0
@@ -126,7 +130,8 @@ class NdiTracker(Tracker):
         self._queue: deque[TrackerFrame] = deque()
         self._number: int | None = None
         self._clock_line = ClockLine()
-        self._next_poll_s = -np.inf
+        self._next_poll_s = self._plugged_s = self._new_s = -np.inf
+        self._period_s = 1.0 / 60.0
         #: reply in use, and the system status and alerts of the last one
         self.mode = mode
         self.system_status = 0
@@ -157,6 +162,7 @@ class NdiTracker(Tracker):
     def _connect(self) -> None:
         """Set up everything; a damaged or missing reply on the way starts it over, a refusal does not."""
         failure: Exception | None = None
+        self._queue.clear()
         for _ in range(_SETUP_TRIES):
             try:
                 self._set_up()
@@ -193,12 +199,11 @@ class NdiTracker(Tracker):
                 self._tools[handle] = _unused(name, list(self._tools.values()))
 
     def _start_tracking(self) -> None:
-        self._session.order("TSTART", timeout_s=5.0)
+        self._session.start_tracking()
         self._tracking = True
         self._silent = self._refused = self._behind = 0
         self._last_raw = -1
         self._clock_line = ClockLine()
-        self._queue.clear()
 
     # reading
 
@@ -235,7 +240,7 @@ class NdiTracker(Tracker):
             raise
         except SilentLine as error:
             self._silent += 1
-            if self._silent < 2:
+            if self._silent < 2 or self._silent * self._reply_timeout_s < _SILENT_S:
                 return None
             raise TransportError(f"{self.line}: the tracker has fallen silent") from error
         except TrackerError as error:
@@ -247,7 +252,7 @@ class NdiTracker(Tracker):
         self._queue.extend(frame for frame in frames if frame is not None)
         self._plan_next(arrival_s, bool(self._queue))
         if any(report.system_status & _PORT_OCCUPIED for report in reports) and self._wired:
-            self._plug_in()
+            self._plug_in(arrival_s)
         return self._queue.popleft() if self._queue else None
 
     def _ask(self) -> list[PoseReport]:
@@ -284,15 +289,15 @@ class NdiTracker(Tracker):
             raise error
 
     def _plan_next(self, arrival_s: float, new: bool) -> None:
-        """Ask again when most of a frame has passed; where the frame was old, a little later."""
-        period_s = 1.0 / 60.0
-        if self._clock_line.fit is not None and 0.002 < self._clock_line.fit.period_s < 0.2 and self.mode != "BX2":
-            period_s = self._clock_line.fit.period_s
-        self._next_poll_s = arrival_s + (0.5 * period_s if new else 0.05 * period_s)
+        """Ask again shortly before the next frame is due; where it was not there yet, a little later."""
+        self._next_poll_s = arrival_s + (0.85 if new else 0.05) * self._period_s
 
-    def _plug_in(self) -> None:
+    def _plug_in(self, now_s: float) -> None:
         """A tool was plugged in: it must be initialised and enabled, which is possible only while not tracking."""
-        self._session.order("TSTOP")
+        if now_s - self._plugged_s < _PLUG_AGAIN_S:
+            return  # a status bit that will not go must not keep the others from being tracked
+        self._plugged_s = now_s
+        self._session.stop_tracking()
         self._tracking = False
         self._enable_wired()
         self._start_tracking()
@@ -305,7 +310,11 @@ class NdiTracker(Tracker):
         if raw is None or not self._is_newer(raw):
             self.counters.repeated += 1
             return None
-        ahead = 1 if self._last_raw < 0 else self._ahead(raw)
+        ahead = 1
+        if self._last_raw >= 0:
+            ahead = self._ahead(raw)
+            self._period_s += 0.1 * (min(0.1, (arrival_s - self._new_s) / ahead) - self._period_s)
+        self._new_s = arrival_s
         self._last_raw = raw
         # after a reconnection the device counts anew; the numbers handed out never go back
         self._number = raw if self._number is None else self._number + ahead
