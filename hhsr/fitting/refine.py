@@ -15,6 +15,8 @@ from hhsr.kernels.selection import solve_normal
 from hhsr.model import MAX_SCALE, FloatArray, IntArray, ModelLeaf, ScaleField
 
 RAYS = 2500
+BOUND_RAYS = 8000
+FARTHEST_HINT = 1.5
 SLACK_OF_DEPTH = 0.3
 SLACK_OF_REACH = 0.1
 MOST_URGENT = 5.0
@@ -54,28 +56,29 @@ class Misses(NamedTuple):
 
 def task_of(solid: Solid, region: Region, members: IntArray, centre: FloatArray, seed: int) -> Task:
     """Return a leaf's task as seen from its centre."""
-    directions = turned_fibonacci(RAYS, seed)
-    origin = np.broadcast_to(centre, directions.shape)
-    reach, cosine = region.exits(centre, directions)
-    hit, _ = solid.triangles.first_hit(origin, directions)
-    through = np.isfinite(reach) & (hit > reach)
-    hit = np.where(np.isfinite(hit), hit, 0.0)
-    bound, urgency = np.zeros(RAYS), np.zeros(RAYS)
-    ends = centre + reach[through, None] * directions[through]
-    depth = solid.triangles.closest(ends)[0] if through.any() else np.zeros(0)
-    slack = np.minimum(
-        np.minimum(SLACK_OF_DEPTH * depth, SLACK_OF_REACH * reach[through]), 0.5 * (hit - reach)[through]
+    free = _rays(solid, region, centre, RAYS, seed)
+    behind = _rays(solid, region, centre, BOUND_RAYS, seed + 1)
+    directions, reach, cosine, hit, _ = (
+        np.concatenate([a[~free.through], b[behind.through]]) for a, b in zip(free, behind, strict=True)
     )
-    bound[through] = reach[through] + slack
-    urgency[through] = np.minimum(depth / np.maximum(slack, 1e-9 * solid.size), MOST_URGENT)
-    urgency[through] *= np.sqrt(np.maximum(cosine[through], GRAZING))
+    through = np.arange(reach.size) >= int((~free.through).sum())
+    bound, urgency, hint = np.zeros(reach.size), np.zeros(reach.size), np.zeros(reach.size)
+    if through.any():
+        ends = centre + reach[through, None] * directions[through]
+        depth = solid.triangles.closest(ends)[0]
+        room = 0.5 * (hit - reach)[through]
+        slack = np.minimum(np.minimum(SLACK_OF_DEPTH * depth, SLACK_OF_REACH * reach[through]), room)
+        bound[through] = reach[through] + slack
+        urgency[through] = np.minimum(depth / np.maximum(slack, 1e-9 * solid.size), MOST_URGENT)
+        urgency[through] *= np.sqrt(np.maximum(cosine[through], GRAZING))
+        hint[through] = np.minimum(hit[through], FARTHEST_HINT * reach[through])
     points, normals = solid.samples.points[members], solid.samples.normals[members]
     offset = points - centre
     radii = np.sqrt((offset**2).sum(axis=1))
     along = offset / np.maximum(radii, 1e-12)[:, None]
     first, _ = solid.triangles.first_hit(np.broadcast_to(centre, along.shape), along)
     seen = (np.einsum("ni,ni->n", along, normals) > 0.0) & ~(first < radii * (1.0 - 1e-6) - 1e-6 * solid.size)
-    return Task(region, points, normals, directions, through, bound, urgency, hit, seen)
+    return Task(region, points, normals, directions, through, bound, urgency, hint, seen)
 
 
 def hold_rows(task: Task, solid: Solid, half_axes: FloatArray) -> Rows:
@@ -85,8 +88,26 @@ def hold_rows(task: Task, solid: Solid, half_axes: FloatArray) -> Rows:
     """
     t = task.through
     wanted = np.maximum(ellipsoid_radii(half_axes, task.directions[t]), task.bound[t])
-    weight = HOLD * np.sqrt(4.0 * np.pi / RAYS / solid.sample_area) * task.bound[t]
+    weight = HOLD * np.sqrt(4.0 * np.pi / BOUND_RAYS / solid.sample_area) * task.bound[t]
     return Rows(task.directions[t], wanted, weight, np.zeros(int(t.sum()), dtype=bool))
+
+
+class _Rays(NamedTuple):
+    """Rays from a centre: (n, 3) directions, (n,) mm to the region's end, cosine there, mm to the first hit, through."""
+
+    directions: FloatArray
+    reach: FloatArray
+    cosine: FloatArray
+    hit: FloatArray
+    through: FloatArray
+
+
+def _rays(solid: Solid, region: Region, centre: FloatArray, count: int, seed: int) -> _Rays:
+    """Cast rays; `through` tells which leave the region inside the solid."""
+    directions = turned_fibonacci(count, seed)
+    reach, cosine = region.exits(centre, directions)
+    hit, _ = solid.triangles.first_hit(np.broadcast_to(centre, directions.shape), directions)
+    return _Rays(directions, reach, cosine, hit, np.isfinite(reach) & (hit > reach))
 
 
 def start_rows(task: Task, solid: Solid, centre: FloatArray) -> Rows:
@@ -95,7 +116,7 @@ def start_rows(task: Task, solid: Solid, centre: FloatArray) -> Rows:
     radii = np.sqrt((offset**2).sum(axis=1))
     along = offset / radii[:, None]
     weights = np.maximum(np.einsum("ni,ni->n", along, task.normals[task.seen]), GRAZING)
-    share = np.sqrt(4.0 * np.pi / RAYS / solid.sample_area)
+    share = np.sqrt(4.0 * np.pi / BOUND_RAYS / solid.sample_area)
     t = task.through
     return Rows(along, radii, weights, np.zeros(radii.size, dtype=bool)).joined(
         Rows(
@@ -112,7 +133,7 @@ def misses(task: Task, solid: Solid, leaf: ModelLeaf, radius: RadiusOf, power: f
 
     power: of the misses whose sum is to fall (2: least squares, 1: their mean).
     """
-    share = 4.0 * np.pi / RAYS / solid.sample_area
+    share, behind = (4.0 * np.pi / count / solid.sample_area for count in (RAYS, BOUND_RAYS))
     offset = task.points[task.seen] - leaf.centre
     r = np.sqrt((offset**2).sum(axis=1))
     along = offset / r[:, None]
@@ -122,7 +143,7 @@ def misses(task: Task, solid: Solid, leaf: ModelLeaf, radius: RadiusOf, power: f
 
     t = task.through
     fell = radius(task.directions[t]) - task.bound[t]
-    fell_weight = np.where(fell < 0.0, share * (task.bound[t] * task.urgency[t]) ** 2, 0.0)
+    fell_weight = np.where(fell < 0.0, behind * (task.bound[t] * task.urgency[t]) ** 2, 0.0)
 
     free = task.directions[~t]
     reach = radius(free)
@@ -146,7 +167,7 @@ def misses(task: Task, solid: Solid, leaf: ModelLeaf, radius: RadiusOf, power: f
 
     base = np.maximum(ellipsoid_radii(leaf.superquadric.half_axes, task.directions[t]), task.bound[t])
     held_miss = fell + task.bound[t] - base
-    held_weight = np.where(fell < 0.0, 0.0, share * (HOLD * task.bound[t]) ** 2)
+    held_weight = np.where(fell < 0.0, 0.0, behind * (HOLD * task.bound[t]) ** 2)
     fell = np.where(fell < 0.0, fell, held_miss)
     fell_weight = np.maximum(fell_weight, held_weight)
     miss = np.concatenate([own, away])
@@ -190,7 +211,7 @@ class RadiusOf:
 def hint_rows(task: Task, solid: Solid) -> Rows:
     """Return where the rays that pass the plane leave the solid: a base that knows it passes without a kink."""
     t = task.through
-    weight = HINT * np.sqrt(4.0 * np.pi / RAYS / solid.sample_area) * task.hint[t]
+    weight = HINT * np.sqrt(4.0 * np.pi / BOUND_RAYS / solid.sample_area) * task.hint[t]
     return Rows(task.directions[t], task.hint[t], weight, np.zeros(int(t.sum()), dtype=bool))
 
 
