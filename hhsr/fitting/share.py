@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from hhsr.errors import FitError
 from hhsr.fitting.options import FitOptions
 from hhsr.fitting.source import Source
@@ -16,20 +14,13 @@ ROWS_PER_CENTRE = 8
 FILLING_STEPS = 7
 
 
-class Claim(NamedTuple):
-    """A leaf that wants centres: its key, its superquadric, its part."""
-
-    key: int
-    leaf: ModelLeaf
-    part: Part
 
 
-class _Ladder:
-    """Fits of one leaf with ever more centres; each is made when it is asked for."""
+class Ladder:
+    """Fits of one leaf with ever more centres; each is made when it is asked for, and kept."""
 
-    def __init__(self, claim: Claim, source: Source) -> None:
-        self.claim = claim
-        self._source = source
+    def __init__(self, leaf: ModelLeaf, part: Part, source: Source) -> None:
+        self._leaf, self._part, self._source = leaf, part, source
         self._rows: dict[int, LeafRows] = {}
         self._fits: dict[int, FieldFit] = {}
 
@@ -38,14 +29,14 @@ class _Ladder:
         if count not in self._fits:
             most = 4000 if ROWS_PER_CENTRE * count <= 4000 else 12_000
             if most not in self._rows:
-                leaf = self.claim.leaf
-                self._rows[most] = leaf_rows(self.claim.part, self._source, leaf.centre, leaf.rotation, most)
-            self._fits[count] = fit_field(self.claim.leaf, self._rows[most], count)
+                leaf = self._leaf
+                self._rows[most] = leaf_rows(self._part, self._source, leaf.centre, leaf.rotation, most)
+            self._fits[count] = fit_field(self._leaf, self._rows[most], count)
         return self._fits[count]
 
 
-def shared_out(claims: list[Claim], source: Source, options: FitOptions, fixed: int) -> dict[int, FieldFit]:
-    """Return the fit of each claim.
+def shared_out(ladders: list[Ladder], options: FitOptions, fixed: int, fill: bool = True) -> list[FieldFit]:
+    """Return a fit for each ladder, `fixed` numbers of the budget being spent elsewhere.
 
     With a budget: the step up some leaf's ladder that saves most mm³ per number is taken while it fits; what is left
     then makes all counts grow alike. Without one: each leaf climbs while a step lowers its error by 5 %, or until
@@ -55,9 +46,8 @@ def shared_out(claims: list[Claim], source: Source, options: FitOptions, fixed: 
     ------
     FitError : not even the bare superquadrics go into the budget.
     """
-    ladders = [_Ladder(claim, source) for claim in claims]
     if options.max_parameters is None:
-        return {ladder.claim.key: ladder.fit(_climbed(ladder, options.max_mean_error_mm)) for ladder in ladders}
+        return [ladder.fit(_climbed(ladder, options.max_mean_error_mm)) for ladder in ladders]
     room = options.max_parameters - fixed - sum(ladder.fit(0).leaf.parameters for ladder in ladders)
     if room < 0:
         raise FitError(
@@ -65,11 +55,11 @@ def shared_out(claims: list[Claim], source: Source, options: FitOptions, fixed: 
             f"{options.max_parameters}; allow more, or cut less (a larger t1)"
         )
     counts = _bought(ladders, room)
-    counts = _filled(ladders, counts, room)
-    return {ladder.claim.key: ladder.fit(count) for ladder, count in zip(ladders, counts, strict=True)}
+    counts = _filled(ladders, counts, room) if fill else counts
+    return [ladder.fit(count) for ladder, count in zip(ladders, counts, strict=True)]
 
 
-def _climbed(ladder: _Ladder, goal_mm: float | None) -> int:
+def _climbed(ladder: Ladder, goal_mm: float | None) -> int:
     """Return the count at which further centres no longer pay, or the goal is met."""
     count = 0
     for step in LADDER:
@@ -83,7 +73,7 @@ def _climbed(ladder: _Ladder, goal_mm: float | None) -> int:
     return count
 
 
-def _bought(ladders: list[_Ladder], room: int) -> list[int]:
+def _bought(ladders: list[Ladder], room: int) -> list[int]:
     """Return a count per ladder by steps of most saving per number."""
     counts = [0] * len(ladders)
     while True:
@@ -105,7 +95,7 @@ def _bought(ladders: list[_Ladder], room: int) -> list[int]:
         room -= cost
 
 
-def _filled(ladders: list[_Ladder], counts: list[int], room: int) -> list[int]:
+def _filled(ladders: list[Ladder], counts: list[int], room: int) -> list[int]:
     """Return the counts, all grown by the largest common factor that goes into the room."""
     base = sum(ladder.fit(0).leaf.parameters for ladder in ladders)
     best, low, high = counts, 1.0, 1.6

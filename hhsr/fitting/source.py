@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from hhsr.fitting.options import FitOptions
 from hhsr.fitting.samples import Samples, area_samples, face_areas
 from hhsr.fitting.split import Part
 from hhsr.model import FloatArray, IntArray
@@ -51,3 +52,8 @@ class Source:
             known = part, np.flatnonzero(part.holds(self.samples.points))
             self._inside[id(part)] = known
         return known[1]
+
+
+def threshold_mm(source: Source, options: FitOptions) -> float:
+    """Return t in mm: as asked, or 1/40 of the longest side."""
+    return options.t_mm if options.t_mm is not None else source.extent_mm / 40.0

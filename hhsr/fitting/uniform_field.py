@@ -41,7 +41,8 @@ class LeafRows(NamedTuple):
 
     directions: (n, 3) unit. radii: (n,) mm of the surface. cosines: (n,) of the angle between direction and normal.
     areas: (n,) mm² that each stands for. empty: (m, 3) unit directions with no surface of the part, reach: (m,) mm how
-    far the solid runs there at least, empty_areas: (m,).
+    far the solid runs there at least, empty_areas: (m,). hidden, hidden_radii: (h, 3), (h,) surface that looks back at
+    the centre; no row follows it, but what is missed there is counted.
     """
 
     directions: FloatArray
@@ -51,6 +52,8 @@ class LeafRows(NamedTuple):
     empty: FloatArray
     reach: FloatArray
     empty_areas: FloatArray
+    hidden: FloatArray
+    hidden_radii: FloatArray
 
 
 def leaf_rows(
@@ -85,14 +88,15 @@ def leaf_rows(
         np.ascontiguousarray(directions[empty] @ turn),
         reach[empty],
         EMPTY_SHARE * np.minimum(steps, 10.0 * share * max(index.size, 1) / rays),
+        np.ascontiguousarray(unit[~kept] @ turn),
+        radii[~kept],
     )
 
 
 def _bases(leaf: ModelLeaf, rows: LeafRows) -> tuple[FloatArray, FloatArray]:
     """Return the superquadric's radii (mm) in the directions of the data and of the empty rays."""
     bare = ModelLeaf(leaf.centre, leaf.rotation, leaf.superquadric, ScaleField.none())
-    radii = leaf_radius(bare, np.concatenate([rows.directions, rows.empty]))
-    return radii[: rows.radii.size], radii[rows.radii.size :]
+    return leaf_radius(bare, rows.directions), leaf_radius(bare, rows.empty)
 
 
 def covered_centres(grid: CentreGrid, rows: LeafRows) -> IntArray:
@@ -103,7 +107,7 @@ def covered_centres(grid: CentreGrid, rows: LeafRows) -> IntArray:
 
 
 class FieldFit(NamedTuple):
-    """leaf: with its field. mean_mm: mean distance of the data's directions. area_error: Σ area · distance, mm³."""
+    """leaf: with its field. mean_mm: mean miss of its surface, hidden surface included. area_error: Σ area · miss, mm³."""
 
     leaf: ModelLeaf
     mean_mm: float
@@ -146,16 +150,20 @@ def fit_field(leaf: ModelLeaf, rows: LeafRows, count: int) -> FieldFit:
 
 
 def _figures(field: ScaleField, leaf: ModelLeaf, miss: FloatArray, rows: LeafRows) -> FieldFit:
-    """Return the leaf with the field and what it misses."""
+    """Return the leaf with the field and what it misses: seen and hidden surface, and dents where the region is full."""
+    fitted = ModelLeaf(leaf.centre, leaf.rotation, leaf.superquadric, field)
+    each = float(rows.areas[0]) if rows.areas.size else 0.0
     total = float((miss * rows.areas).sum())
-    mean = total / max(float(rows.areas.sum()), 1e-300)
-    return FieldFit(ModelLeaf(leaf.centre, leaf.rotation, leaf.superquadric, field), mean, total)
+    total += each * float(np.abs(leaf_radius(fitted, rows.hidden) - rows.hidden_radii).sum())
+    area = each * (rows.radii.size + rows.hidden_radii.size)
+    total += float((rows.empty_areas * np.maximum(rows.reach - leaf_radius(fitted, rows.empty), 0.0)).sum())
+    return FieldFit(fitted, total / max(area, 1e-300), total)
 
 
 def best_centre(part: Part, source: Source, seed: int, candidates: int = 12) -> FloatArray | None:
     """Return the point inside the part and the solid about which a cheap radial fit misses least; None: none is inside.
 
-    Candidates are far from each other and from the surface; each is judged by an ellipsoid and 24 centres.
+    Candidates are far from each other and from the surface; each is judged by a sphere and 24 centres.
     """
     inner, depth = interior_points(part, source, seed)
     if inner.shape[0] == 0:
@@ -164,7 +172,7 @@ def best_centre(part: Part, source: Source, seed: int, candidates: int = 12) -> 
     errors = []
     for centre in inner[chosen]:
         rows = leaf_rows(part, source, centre, np.zeros(3), most=600, rays=300)
-        errors.append(_cheap_error(centre, rows, part, source))
+        errors.append(_cheap_error(centre, rows))
     return inner[chosen[int(np.argmin(errors))]]
 
 
@@ -206,14 +214,12 @@ def _spread(points: FloatArray, depth: FloatArray, count: int) -> IntArray:
     return np.array(chosen)
 
 
-def _cheap_error(centre: FloatArray, rows: LeafRows, part: Part, source: Source) -> float:
-    """Return what an ellipsoid of the rows' size with 24 centres misses, mm, hidden samples counted as missed."""
+def _cheap_error(centre: FloatArray, rows: LeafRows) -> float:
+    """Return what a sphere of the rows' size with 24 centres misses, mm."""
     if rows.radii.size < 12:
         return math.inf
     leaf = ModelLeaf(centre, np.zeros(0), _ball(rows), ScaleField.none())
-    fit = fit_field(leaf, rows, 24)
-    seen = rows.areas.sum() / (source.area_mm2 * source.inside(part).size / source.samples.points.shape[0])
-    return fit.mean_mm + (1.0 - min(float(seen), 1.0)) * float(np.median(rows.radii))
+    return fit_field(leaf, rows, 24).mean_mm
 
 
 def _ball(rows: LeafRows) -> Superquadric:
