@@ -243,14 +243,15 @@ class IgtlServer:
     _MOST_WAITING = 8 << 20
 
     def __init__(self, port: int = DEFAULT_PORT, host: str = "127.0.0.1", clock: Clock | None = None) -> None:
+        if not 0 <= port < 65536:
+            raise DeviceInputError(f"a TCP port lies in 0–65535, got {port}")
         self.host, self.port = host, port
         self.clock = SystemClock() if clock is None else clock
         self.dropped = 0
         self._lock = threading.Lock()
         self._waiting: dict[socket.socket, bytearray] = {}
         self._readers: dict[socket.socket, MessageReader] = {}
-        self._listener: socket.socket | None = None
-        self._wake, self._woken = socket.socketpair()
+        self._wake: socket.socket | None = None
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -263,31 +264,26 @@ class IgtlServer:
     def start(self) -> Self:
         """Listen; returns once clients can connect."""
         try:
-            self._listener = socket.create_server((self.host, self.port))
-        except (OSError, OverflowError) as error:
+            listener = socket.create_server((self.host, self.port))
+        except OSError as error:
             raise TransportError(f"cannot listen on {self.host}:{self.port}: {error}") from error
-        self._listener.setblocking(False)
-        self.port = self._listener.getsockname()[1]
+        listener.setblocking(False)
+        self.port = listener.getsockname()[1]
         self._stopping.clear()
-        self._thread = threading.Thread(target=self._run, name=f"OpenIGTLink server {self.port}", daemon=True)
+        self._wake, woken = socket.socketpair()
+        name = f"OpenIGTLink server {self.port}"
+        self._thread = threading.Thread(target=self._run, args=(listener, woken), name=name, daemon=True)
         self._thread.start()
         return self
 
     def stop(self) -> None:
         """Close all connections."""
         self._stopping.set()
-        self._wake.send(b"x")
-        if self._thread is not None:
+        if self._thread is not None and self._wake is not None:
+            self._wake.send(b"x")
             self._thread.join(5.0)
-            self._thread = None
-        with self._lock:
-            for client in list(self._waiting):
-                self._drop(client)
-        if self._listener is not None:
-            self._listener.close()
-            self._listener = None
-        self._wake.close()
-        self._woken.close()
+            self._wake.close()
+            self._thread = self._wake = None
 
     def __enter__(self) -> Self:
         return self.start()
@@ -319,8 +315,8 @@ class IgtlServer:
                 self._waiting[client] += data
                 self._flush(client)
             behind = any(self._waiting.values())
-        if behind:
-            self._wake.send(b"x")
+            if behind and self._wake is not None:
+                self._wake.send(b"x")
 
     def _flush(self, client: socket.socket) -> None:
         waiting = self._waiting[client]
@@ -340,28 +336,30 @@ class IgtlServer:
         self._readers.pop(client, None)
         client.close()
 
-    def _run(self) -> None:
-        listener = self._listener
-        assert listener is not None
-        while not self._stopping.is_set():
+    def _run(self, listener: socket.socket, woken: socket.socket) -> None:
+        with listener, woken:
+            while not self._stopping.is_set():
+                with self._lock:
+                    clients = list(self._waiting)
+                    behind = [client for client in clients if self._waiting[client]]
+                try:
+                    readable, writable, _ = select.select([listener, woken, *clients], behind, [], 0.5)
+                except (OSError, ValueError):
+                    continue  # a client was dropped by `send` in between
+                for ready in readable:
+                    if ready is woken:
+                        woken.recv(4096)
+                    elif ready is listener:
+                        self._accept(listener)
+                    else:
+                        self._listen_to(ready)
+                with self._lock:
+                    for client in writable:
+                        if client in self._waiting:
+                            self._flush(client)
             with self._lock:
-                clients = list(self._waiting)
-                behind = [client for client in clients if self._waiting[client]]
-            try:
-                readable, writable, _ = select.select([listener, self._woken, *clients], behind, [], 0.5)
-            except (OSError, ValueError):
-                continue  # a client was dropped by `send` in between
-            for ready in readable:
-                if ready is self._woken:
-                    self._woken.recv(4096)
-                elif ready is listener:
-                    self._accept(listener)
-                else:
-                    self._listen_to(ready)
-            with self._lock:
-                for client in writable:
-                    if client in self._waiting:
-                        self._flush(client)
+                for client in list(self._waiting):
+                    self._drop(client)
 
     def _accept(self, listener: socket.socket) -> None:
         try:

@@ -14,6 +14,7 @@ __all__ = [
     "quaternion_from_rotation",
     "rotation_from_quaternion",
     "rotation_from_vector",
+    "vector_from_rotation",
 ]
 
 
@@ -88,6 +89,15 @@ def rotation_from_vector(vector: ArrayLike) -> NDArray[np.float64]:
     return rotation_from_quaternion(np.append(math.cos(0.5 * angle), scale * v))
 
 
+def vector_from_rotation(R: ArrayLike) -> NDArray[np.float64]:
+    """Axis times angle, rad, (3,) of a rotation matrix (3, 3); the angle lies in [0, π]."""
+    q = quaternion_from_rotation(R)
+    sine = float(np.linalg.norm(q[1:]))
+    if sine < 1e-12:
+        return np.asarray(2.0 * q[1:])
+    return np.asarray(2.0 * math.atan2(sine, float(q[0])) / sine * q[1:])
+
+
 def pose_from_quaternion(quaternion: ArrayLike, position: ArrayLike) -> NDArray[np.float64]:
     """Rigid (4, 4) matrix, mm, from a quaternion (w, x, y, z) and a position (3,) in mm."""
     T = np.eye(4)
@@ -115,12 +125,8 @@ def interpolate(T_start: ArrayLike, T_end: ArrayLike, fraction: float) -> NDArra
         return a.copy()
     if fraction == 1.0:
         return b.copy()
-    q = quaternion_from_rotation(a[:3, :3].T @ b[:3, :3])
-    sine = float(np.linalg.norm(q[1:]))
-    angle = 2.0 * math.atan2(sine, float(q[0]))
     T = np.eye(4)
-    T[:3, :3] = a[:3, :3]
-    if sine > 0.0:
-        T[:3, :3] = a[:3, :3] @ rotation_from_vector(fraction * angle / sine * q[1:])
+    turn = vector_from_rotation(a[:3, :3].T @ b[:3, :3])
+    T[:3, :3] = a[:3, :3] @ rotation_from_vector(fraction * turn)
     T[:3, 3] = (1.0 - fraction) * a[:3, 3] + fraction * b[:3, 3]
     return T

@@ -239,6 +239,8 @@ class TcpEmulator(Emulator):
         self, device: Device | None = None, faults: Faults | None = None, port: int = 0, host: str = "127.0.0.1"
     ) -> None:
         super().__init__(device, faults)
+        if not 0 <= port < 65536:
+            raise DeviceInputError(f"a TCP port lies in 0–65535, got {port}")
         self.host, self.port = host, port
         self._listener: socket.socket | None = None
         self._client: socket.socket | None = None
@@ -251,7 +253,7 @@ class TcpEmulator(Emulator):
     def _listen(self) -> None:
         try:
             self._listener = socket.create_server((self.host, self.port))
-        except (OSError, OverflowError) as error:
+        except OSError as error:
             raise TransportError(f"cannot listen on {self.host}:{self.port}: {error}") from error
         self.port = self._listener.getsockname()[1]
 
