@@ -143,10 +143,9 @@ def _fill_holes(
         return faces, vertices
     longest = float(np.ptp(vertices[np.unique(faces)], axis=0).max())
     corners = vertices[faces]
-    area = (
-        float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()) / 2
-    )
-    widths = [float(np.linalg.norm(np.ptp(vertices[loop], axis=0))) for loop in loops]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = float(np.linalg.norm(normals, axis=1).sum()) / 2.0
+    widths = [float(np.ptp(vertices[loop], axis=0).max()) for loop in loops]
     holes = sum(_ring_area(vertices[loop]) for loop in loops)
     if max(widths) > HOLE_WIDTH_SHARE * longest or holes > HOLE_AREA_SHARE * area:
         raise SurfaceError(
