@@ -146,6 +146,8 @@ class IgtlTracker(Tracker):
 
     def _read(self, timeout_s: float) -> TrackerFrame | None:
         if not self._queue and not self.line.is_open:
+            if not self._may_reconnect(timeout_s):
+                return None
             self._open()
             self.counters.reconnects += 1
         remaining_s = timeout_s

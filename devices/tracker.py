@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from threading import Event
@@ -13,6 +14,8 @@ from devices.errors import DeviceInputError, TrackerError
 from devices.frame import TrackerFrame
 
 __all__ = ["LineCounters", "Tracker"]
+
+_ATTEMPT_EVERY_S = 0.25
 
 
 @dataclass
@@ -51,6 +54,7 @@ class Tracker(ABC):
         self.counters = LineCounters()
         self._stopping = Event()
         self._running = False
+        self._next_attempt_s = -math.inf
 
     @property
     @abstractmethod
@@ -120,6 +124,19 @@ class Tracker(ABC):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.stop()
+
+    def _may_reconnect(self, timeout_s: float) -> bool:
+        """Wait, within the timeout, until the next try to find a lost device is due; tell whether it is.
+
+        Tries are a quarter of a second apart, so a caller that just reads on does not spin.
+        """
+        now_s = self.clock.now_s()
+        self.clock.wait_until(min(self._next_attempt_s, now_s + timeout_s), self._stopping)
+        now_s = self.clock.now_s()
+        if now_s < self._next_attempt_s or self._stopping.is_set():
+            return False
+        self._next_attempt_s = now_s + _ATTEMPT_EVERY_S
+        return True
 
     def _start(self) -> None:  # noqa: B027 - not every tracker has something to open
         """Open the device."""

@@ -214,6 +214,8 @@ class NdiTracker(Tracker):
                 return None
             try:
                 if not self._tracking:
+                    if not self._may_reconnect(timeout_s):
+                        return None
                     self._connect()
                     self.counters.reconnects += 1
                 while True:
