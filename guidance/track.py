@@ -23,7 +23,7 @@ from devices.registry import open_tracker
 from devices.stream import Stream
 from devices.tracker import Tracker
 
-__all__ = ["Session", "track"]
+__all__ = ["Session", "terminated_as_interrupted", "track"]
 
 _REDRAW_S = 0.1
 _STALE_S = 0.5
@@ -92,8 +92,8 @@ class Session:
 
 
 @contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
-    """Let SIGTERM end the command as Ctrl-C does, so that the tracker is stopped and the recording closed."""
+def terminated_as_interrupted() -> Iterator[None]:
+    """Let SIGTERM end a command as Ctrl-C does, so that trackers are stopped and files closed."""
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
@@ -116,7 +116,7 @@ def track(
     console = Console()
     try:
         with ExitStack() as stack:
-            stack.enter_context(_terminated_as_interrupted())
+            stack.enter_context(terminated_as_interrupted())
             tracker = open_tracker(url)
             session = Session(tracker)
             recorder = None if record is None else stack.enter_context(Recorder(record, source=url))

@@ -12,10 +12,11 @@ import typer
 from devices.errors import DeviceError
 from devices.ndi.bodies import RecordedBodies, SimulatedBodies
 from devices.ndi.device import Device
-from devices.ndi.emulator import Emulator, PtyEmulator, TcpEmulator
+from devices.ndi.emulator import PtyEmulator, TcpEmulator
 from devices.ndi.faults import Faults
 from devices.ndi.ports import FIRST_WIRED_HANDLE
 from devices.recording import read_recording
+from guidance.track import terminated_as_interrupted
 
 __all__ = ["make_emulator", "tracker_emulator"]
 
@@ -32,14 +33,13 @@ def make_emulator(
     api_revision: str,
     bare_unoccupied: bool,
     host: str,
-) -> tuple[Emulator, dict[str, object]]:
+) -> tuple[PtyEmulator | TcpEmulator, dict[str, object]]:
     """Make the emulator that the command's options describe, and what the command says of it (path and port follow)."""
     if pty == (tcp is not None):
         raise typer.BadParameter("give either --pty or --tcp PORT")
     bodies = RecordedBodies(read_recording(replay)) if replay is not None else SimulatedBodies(tools, rate_hz)
     device = Device(bodies, None, rate_hz, wired=wired, api_revision=api_revision, bare_unoccupied=bare_unoccupied)
-    names = list(bodies.names) if isinstance(bodies, RecordedBodies) else [f"BODY-{k}" for k in range(tools)]
-    handles = {f"{FIRST_WIRED_HANDLE + k:02X}": name for k, name in enumerate(names)} if wired else {}
+    handles = {f"{FIRST_WIRED_HANDLE + k:02X}": bodies.name(k) for k in range(len(bodies))} if wired else {}
     said: dict[str, object] = {"handles": list(handles), "tools": handles, "rate_hz": rate_hz}
     if tcp is not None:
         return TcpEmulator(device, faults, tcp, host), said
@@ -72,19 +72,17 @@ def tracker_emulator(
 ) -> None:
     """Emulate an NDI tracker until interrupted; print one JSON line with its path or port once it listens."""
     try:
-        faults = Faults.parse(fault or [], seed)
-        emulator, said = make_emulator(
-            pty, tcp, link, tools, replay, faults, rate, wired, api_revision, bare_unoccupied, host
-        )
-        emulator.start()
+        with terminated_as_interrupted():
+            faults = Faults.parse(fault or [], seed)
+            emulator, said = make_emulator(
+                pty, tcp, link, tools, replay, faults, rate, wired, api_revision, bare_unoccupied, host
+            )
+            with emulator:
+                where = {"path": emulator.path} if isinstance(emulator, PtyEmulator) else {"port": emulator.port}
+                typer.echo(json.dumps(where | {"url": emulator.url} | said))
+                threading.Event().wait()
+    except KeyboardInterrupt:
+        pass
     except DeviceError as error:
         typer.echo(f"tracker-emulator: {error}", err=True)
         raise typer.Exit(2) from None
-    try:
-        where = {"path": emulator.path} if isinstance(emulator, PtyEmulator) else {"port": getattr(emulator, "port", 0)}
-        typer.echo(json.dumps(where | {"url": emulator.url} | said))
-        threading.Event().wait()
-    except KeyboardInterrupt:
-        pass
-    finally:
-        emulator.stop()

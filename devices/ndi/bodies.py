@@ -47,6 +47,10 @@ class Bodies(ABC):
     def __len__(self) -> int:
         """Number of bodies."""
 
+    def name(self, body: int) -> str:
+        """Name of a body; a tool on a cable carries it as its part number."""
+        return f"BODY-{body}"
+
     @abstractmethod
     def pose(self, body: int, frame: int) -> BodyPose | None:
         """Pose of a body in the frame counted from the start of tracking, or None where it is not seen."""
@@ -104,6 +108,10 @@ class RecordedBodies(Bodies):
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def name(self, body: int) -> str:
+        """Name of the recorded tool."""
+        return self.names[body % len(self.names)]
 
     def pose(self, body: int, frame: int) -> BodyPose | None:
         """Recorded pose, or None where the recording has none that is OK or out of volume."""

@@ -105,7 +105,7 @@ class Device:
         """Return to the state after power-up: 9600 baud, not initialised, wired tools plugged in."""
         self.initialised = self.tracking = False
         self.baud_rate = 9600
-        self.ports = Ports(len(self.bodies) if self._wired else 0)
+        self.ports = Ports([self.bodies.name(k) for k in range(len(self.bodies))] if self._wired else [])
         self._started_s = 0.0
         self._told: int | None = None
         self._buffer.clear()

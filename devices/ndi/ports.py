@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from devices.errors import DeviceInputError
@@ -36,6 +36,7 @@ class Port:
     memory: bytearray = field(default_factory=bytearray)
     definition: ToolDefinition | None = None
     switches: int = 0
+    part_number: str = ""
 
     @property
     def status(self) -> int:
@@ -49,12 +50,12 @@ class Ports:
 
     Parameters
     ----------
-    wired : int
-        Number of tools on cables; their handles count from 0A.
+    wired : sequence of str
+        Part numbers of the tools on cables; their handles count from 0A.
     """
 
-    def __init__(self, wired: int) -> None:
-        self.handles = {FIRST_WIRED_HANDLE + k: Port(k, wired=True) for k in range(wired)}
+    def __init__(self, wired: Sequence[str]) -> None:
+        self.handles = {FIRST_WIRED_HANDLE + k: Port(k, True, part_number=name) for k, name in enumerate(wired)}
 
     def initialise_all(self) -> None:
         """INIT: free what was loaded, and set wired tools back."""
@@ -168,7 +169,7 @@ class Ports:
         if not port.occupied:
             return "UNOCCUPIED"
         name = port.definition.manufacturer if port.definition else "EMULATOR"
-        number = port.definition.part_number if port.definition else f"BODY-{port.body}"
+        number = port.definition.part_number if port.definition else port.part_number
         handle, wireless = int(arguments[:2], 16), int(not port.wired)
         parts = {
             # type, switches, LEDs, reserved, subtype, maker, revision, serial number, status

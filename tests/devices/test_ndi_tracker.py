@@ -217,7 +217,7 @@ def test_a_tracker_reset_in_the_middle_is_noticed() -> None:
 def test_a_tool_plugged_in_later_joins() -> None:
     with TcpEmulator(Device(SimulatedBodies(1))) as emulator, NdiTracker(place(emulator), mode="TX") as tracker:
         assert tracker.tool_names == ("BODY-0",)
-        emulator.device.ports.handles[0x0B] = Port(1, wired=True)
+        emulator.device.ports.handles[0x0B] = Port(1, wired=True, part_number="BODY-1")
         emulator.device.system_status = 0x40
         frame = tracker.read(2.0)
         while "BODY-1" not in frame.tools:

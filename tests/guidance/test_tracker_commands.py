@@ -49,7 +49,7 @@ def emulator(*arguments: str) -> Iterator[dict[str, object]]:
         assert process.stdout is not None
         yield json.loads(process.stdout.readline())
     finally:
-        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGTERM)
         process.wait(LIMIT_S)
         process.stdout.close()
 
@@ -127,10 +127,10 @@ def test_the_emulator_replays_a_recording_over_tcp() -> None:
                 frame = tracker.read(5.0)
                 assert frame is not None
                 truth = recorded[(frame.number - 1) % len(recorded)]
-                for k, name in enumerate(truth.tools):
-                    T = frame.tools[f"BODY-{k}"].T_tracker_tool
+                for name in truth.tools:
+                    T = frame.tools[name].T_tracker_tool
                     expected = truth.tools[name].T_tracker_tool
-                    assert frame.tools[f"BODY-{k}"].status is ToolStatus.OK
+                    assert frame.tools[name].status is ToolStatus.OK
                     np.testing.assert_allclose(T[:3, 3], expected[:3, 3], atol=1e-4)
                     q = quaternion_from_rotation(expected[:3, :3])
                     np.testing.assert_allclose(np.abs(quaternion_from_rotation(T[:3, :3]) @ q), 1.0, atol=1e-6)
