@@ -19,6 +19,7 @@ from hhsr.kernels import slab as slab_at
 from hhsr.kernels.crossing import cross_many, first_exits
 from hhsr.kernels.maps import blocks_of, build_map, pyramid_size
 from hhsr.kernels.region_box import leaf_box, part_box
+from hhsr.kernels.slab_bounds import fill_lobe_spheres
 from hhsr.model import Cut, FloatArray, ModelLeaf, Node, RetainedPart, Tree, frozen, rotation_matrix
 from hhsr.triangle_tree import TriangleTree
 
@@ -234,7 +235,8 @@ class _Layout:
             starts.append(tables)
             lobe = [0] * slab_at.LOBE_INT_SIZE
             lobe[slab_at.LOBE_TABLES] = tables
-            lobe[slab_at.LOBE_AXES] = parts.add_floats(arrays.half_axes)
+            lobe[slab_at.LOBE_AXES] = parts.add_floats(np.concatenate([arrays.half_axes, np.ones(2)]))
+            lobe[slab_at.LOBE_SPHERES] = parts.add_floats(np.zeros(6 * slab_at.TABLE))
             lobe[slab_at.LOBE_SPLINE] = parts.add_floats(arrays.angle)
             lobe[slab_at.LOBE_SEGMENTS] = len(arrays.angle)
             lobe[slab_at.LOBE_CENTRES] = parts.add_floats(arrays.centres)
@@ -259,6 +261,7 @@ class _Layout:
         slab_at.LOBE_CENTRES,
         slab_at.LOBE_WEIGHTS,
         slab_at.LOBE_EXTENT,
+        slab_at.LOBE_SPHERES,
     )
 
     def assemble(self) -> FloatArray:
@@ -348,7 +351,19 @@ class _Layout:
                     blob[o : o + slab_at.TABLE] = pair[-1]
                     blob[o + slab_at.TABLE] = pair[-1][0]
                 found[node].append((pair[0], pair[1]))
+            self._fill_strips(blob, blob_view, node)
         return tuple(tuple(found[node]) for _, node, _ in self.cuts)
+
+    def _fill_strips(self, blob: FloatArray, blob_view: FloatArray, node: int) -> None:
+        """Prove the enclosures of a slab's strips."""
+        ints = blob_view.view(np.int64)
+        slab = self.owners[self.nodes[node][3]].record
+        lobes_at, starts = self.slab_records[node]
+        for k in range(len(starts)):
+            lobe = lobes_at + slab_at.LOBE_INT_SIZE * k
+            spheres = int(ints[lobe + slab_at.LOBE_SPHERES])
+            out = blob[spheres : spheres + 6 * slab_at.TABLE].reshape(slab_at.TABLE, 6)
+            fill_lobe_spheres(blob_view, ints, slab, lobe, out)
 
     def _reach(self, blob: FloatArray) -> float:
         """Return a length (mm) that no straight line within the solid can reach."""
@@ -388,15 +403,17 @@ class _Layout:
     def _slab_box(
         self, blob_view: FloatArray, cut: Cut, node: int, rotation: FloatArray, shift: FloatArray
     ) -> FloatArray:
+        ints = blob_view.view(np.int64)
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
-        for start, contour in zip(self.slab_records[node][1], cut.contours, strict=True):
-            # |r| ≤ the greatest control value of the Bézier; C' = 2C − (L + R)/2 ≤ 2C.
-            ends = float(blob_view[start + 2 : start + 2 + 2 * (slab_at.TABLE + 1)].max())
-            far = max(ends, 2.0 * contour_bound(contour))
-            centre = rotation @ (cut.frame.T @ np.array([*contour.centre, cut.offset])) + shift
-            e1, e2, n = (rotation @ axis for axis in cut.frame)
-            half = far * np.sqrt(e1**2 + e2**2) + cut.half_width * np.abs(n)
-            low, high = np.minimum(low, centre - half), np.maximum(high, centre + half)
+        lobes_at, starts = self.slab_records[node]
+        for k in range(len(starts)):
+            o = int(ints[lobes_at + slab_at.LOBE_INT_SIZE * k + slab_at.LOBE_SPHERES])
+            spheres = blob_view[o : o + 6 * slab_at.TABLE].reshape(-1, 6)
+            spheres = spheres[spheres[:, 5] > 0.0]
+            if len(spheres):
+                centres = spheres[:, :3] @ rotation.T + shift
+                low = np.minimum(low, (centres - spheres[:, 3:4]).min(axis=0))
+                high = np.maximum(high, (centres + spheres[:, 3:4]).max(axis=0))
         return np.concatenate([low, high])
 
     def fill_edges(self, blob: FloatArray, blob_view: FloatArray) -> None:
@@ -431,11 +448,6 @@ class _Layout:
         boxes.extend(np.concatenate([p, p]) for p in ends)
         low, high = _union(boxes)
         return np.array([low, high]) if np.isfinite(low).all() else np.full((2, 3), np.nan)
-
-
-def contour_bound(contour: object) -> float:
-    """Return a proven upper bound (mm) of a contour's radius: (1 − s) ≤ 1 + Σ|w|, q ≤ √2 times the largest half axis."""
-    return float(math.sqrt(2.0) * contour.half_axes.max() * (1.0 + np.abs(contour.weights).sum()))  # type: ignore[attr-defined]
 
 
 def _union(boxes: list[FloatArray]) -> tuple[FloatArray, FloatArray]:

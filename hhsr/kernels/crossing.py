@@ -88,7 +88,9 @@ def owner_crossings(
         )
     if kind == RETAINED:
         return part_crossings(blob, ints, record, px, py, pz, dx, dy, dz, t0, t1, state, out, count)
-    return slab_crossings(blob, ints, record, px, py, pz, dx, dy, dz, t0, t1, resolution, state, out, count, work)
+    return slab_crossings(
+        blob, ints, record, px, py, pz, dx, dy, dz, t0, t1, resolution, tolerance, state, out, count, work
+    )
 
 
 @njit(cache=True)

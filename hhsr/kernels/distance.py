@@ -31,6 +31,7 @@ from hhsr.kernels.layout import (
 from hhsr.kernels.nearest import (
     BEST,
     BEST_T,
+    FAR,
     FOOT,
     LENGTH2,
     NODE_ROOM,
@@ -78,7 +79,7 @@ def set_search(search, px, py, pz, dx, dy, dz, tolerance):
     search[START], search[START + 1], search[START + 2] = px, py, pz
     search[VECTOR], search[VECTOR + 1], search[VECTOR + 2] = dx, dy, dz
     search[LENGTH2] = dx * dx + dy * dy + dz * dz
-    search[BEST], search[BEST_T] = np.inf, 0.0
+    search[BEST], search[BEST_T] = FAR, 0.0
     search[FOOT], search[FOOT + 1], search[FOOT + 2] = np.nan, np.nan, np.nan
     search[TOLERANCE] = tolerance
 
@@ -92,7 +93,7 @@ def _nearest_on_owner(blob, ints, tab, owner, search, local, nodes, keys, corner
         nearest_on_part(blob, ints, record, planes, count, search, nodes, keys, corners, spare)
         return
     if kind != MODEL:
-        nearest_on_slab(blob, ints, record, planes, count, search, nodes, keys, corners, spare, rects)
+        nearest_on_slab(blob, ints, record, planes, count, search, corners, spare, rects)
         return
     frame = ints[record + FRAME]
     qx, qy, qz = into_leaf(blob, ints, record, search[START], search[START + 1], search[START + 2])
@@ -157,6 +158,8 @@ def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, 
         box = blob[ints[o + OWNER_BOX] : ints[o + OWNER_BOX] + 6]
         if box[0] <= box[3] and box_bound(box, search) < search[BEST] - search[TOLERANCE]:
             _nearest_on_owner(blob, ints, tab, owner, search, local, nodes, keys, corners, spare, rects)
+    if search[BEST] == FAR:
+        search[BEST] = np.inf
 
 
 @njit(cache=True, nogil=True)

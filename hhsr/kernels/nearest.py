@@ -8,10 +8,12 @@ left is parted, down to the tolerance.
 
 import math
 
+import numpy as np
 from numba import njit
 
 from hhsr.kernels.cell import cell_model, chart_of, direction_of, inverse_radius
 from hhsr.kernels.layout import (
+    BOX,
     CELL_SIZE,
     CELL_TABLE,
     CELLS,
@@ -23,13 +25,14 @@ from hhsr.kernels.layout import (
     SPHERE_TABLE,
     VALUE,
 )
-from hhsr.kernels.maps import level_start, model_thickness, quad_radius_ok
+from hhsr.kernels.maps import cell_sphere, level_start, model_thickness, quad_radius_ok
 from hhsr.kernels.polygon import clip_polygon, polygon_to_segment
 
 # Slots of a search: start 3, vector 3, squared length; best distance, t, point 3 (owner's frame); tolerance.
 START, VECTOR, LENGTH2, BEST, BEST_T, FOOT, TOLERANCE = 0, 3, 6, 7, 8, 9, 12
 SEARCH_SIZE = 16
 NODE_ROOM = 256
+FAR = 1e150  # mm: no surface point found yet; finite, so that "no surface here" (infinite) is beyond it
 FINEST = 1e-5  # mm: a piece of surface smaller than this is taken as a point
 
 
@@ -96,10 +99,18 @@ def cell_bound(
 ):
     """Return a lower bound of the segment's distance to the cell's surface in the region; offer a point of it.
 
-    1e300 where no surface of the cell lies in the region; −1 where the cell's model is too coarse to say.
+    Infinite where no surface of the cell lies in the region. A cell too steep for its tangent plane is bounded by a sphere.
     """
     if not quad_radius_ok(value, ga, gb, error, half_a, half_b):
-        return -1.0
+        reach = abs(ga) * half_a + abs(gb) * half_b + error
+        lo = max(value - reach, 1.0 / blob[ints[leaf + BOX] + 7])
+        x, y, z, radius = cell_sphere(face, a, b, half_a, half_b, value, ga, gb, error, lo, value + reach)
+        if outside_region(blob, planes, count, x, y, z, radius):
+            return np.inf
+        distance, _ = distance_to(search, x, y, z)
+        x, y, z = direction_of(face, a, b)
+        offer_patch_point(blob, ints, leaf, planes, count, search, face, x, y, z, radius)
+        return distance - radius
     thick = model_thickness(face, a, b, half_a, half_b, value, ga, gb, error)
     for corner in range(4):
         da = half_a if corner == 1 or corner == 2 else -half_a
@@ -112,7 +123,7 @@ def cell_bound(
         o = planes + 4 * k
         size = clip_polygon(corners, size, spare, blob[o], blob[o + 1], blob[o + 2], blob[o + 3] + thick)
         if size == 0:
-            return 1e300
+            return np.inf
     c = value - ga * a - gb * b
     if face % 2 == 1:
         c = -c
