@@ -17,6 +17,7 @@ from hhsr.surface.polish import polish
 from hhsr.surface.sample import Halfspace, tessellate
 from hhsr.surface.sources import Patch, Retained, Source, Step, Strip
 from hhsr.surface.tidy import tidy
+from hhsr.surface.trim import trim
 
 # Vertices are on the surface and facets are chords, so all misses point inwards: a share of what was asked keeps the
 # mean far below it (measured: mean radial miss 0.39 of the edge tolerance).
@@ -105,7 +106,7 @@ class _Assembly:
     def _side(self, cut: Cut, piece: Piece, side: int, step: int) -> Piece:
         """Return a child's solid on its side of the slab, in the cut's frame, its outline on the plane exact."""
         height = side * cut.half_width
-        trimmed = self.bodies.trimmed(to_cut(cut, piece), side, height, step)
+        trimmed = trim(self.bodies, to_cut(cut, piece), side, height, step)
         return self._polished(cut, trimmed, trimmed.vertices[:, 2] == height)
 
     def _bands(self, cut: Cut, below: Piece, above: Piece, steps: tuple[int, int]) -> list[Piece]:

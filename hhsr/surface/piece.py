@@ -73,15 +73,8 @@ class Bodies:
         return Piece(np.array(mesh.vert_properties[:, :3], dtype=np.float64), faces, source)
 
     def trimmed(self, piece: Piece, side: int, height: float, cut_face: int) -> Piece:
-        """Return the part with side · z ≥ side · height, side = ±1; the new faces lie at z = height exactly."""
-        z = piece.vertices[:, 2]
-        z = np.where(np.abs(z - height) < SNAP, height, z)
-        snapped = Piece(np.column_stack([piece.vertices[:, :2], z]), piece.faces, piece.source)
-        if len(z) == 0 or (side * (z - height) >= 0).all():
-            return snapped
-        if (side * (z - height) <= 0).all():
-            return Piece.empty()
-        cut = self.piece(self.body(snapped).trim_by_plane((0.0, 0.0, float(side)), side * height), cut_face)
+        """Return the part with side · z ≥ side · height, side = ±1, closed by faces of source `cut_face`."""
+        cut = self.piece(self.body(piece).trim_by_plane((0.0, 0.0, float(side)), side * height), cut_face)
         cut.vertices[np.abs(cut.vertices[:, 2] - height) < SNAP, 2] = height
         return cut
 

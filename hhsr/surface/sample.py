@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hhsr.evaluate import LeafArrays, leaf_arrays
 from hhsr.kernels.leaf import leaf_radii
+from hhsr.kernels.mesh_edges import number_edges
 from hhsr.model import FloatArray, IntArray, ModelLeaf, rotation_matrix
 
 START_LEVEL = 4  # 2,562 directions, 0.07 rad apart: the finest scale-field centres are about as dense
@@ -74,10 +75,7 @@ def _edges_to_split(
 
     Only active faces are looked at: the others were found flat enough before. A split edge may still belong to one.
     """
-    pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    keys, inverse = np.unique(pairs[:, 0] * len(points) + pairs[:, 1], return_inverse=True)
-    edges = np.stack([keys // len(points), keys % len(points)], axis=1)
-    of_face = inverse.reshape(-1, 3)
+    edges, of_face = number_edges(faces, len(points))
     some, of_some = faces[active], of_face[active]
     corners = points[some]
     span = corners[:, [1, 2, 0]] - corners
@@ -86,7 +84,9 @@ def _edges_to_split(
     facet = np.cross(span[:, 0], -span[:, 2])
     facet /= np.maximum(np.linalg.norm(facet, axis=1, keepdims=True), 1e-300)
 
-    wanted = np.unique(of_some[near])
+    asked = np.zeros(len(edges), dtype=bool)
+    asked[of_some[near]] = True
+    wanted = np.flatnonzero(asked)
     middles = np.zeros((len(edges), 3))
     middles[wanted] = points[edges[wanted]].mean(axis=1)
     slope = np.zeros(len(edges))
@@ -95,14 +95,15 @@ def _edges_to_split(
     middles[wanted] = _on_surface(flat, arrays)
     slope = np.maximum(slope[wanted] / np.linalg.norm(flat, axis=1), FLATTEST)
     gap = np.linalg.norm(middles[wanted] - flat, axis=1)
-    marked = [wanted[gap * slope > tolerance_mm]]
+    marked = np.zeros(len(edges), dtype=bool)
+    marked[wanted[gap * slope > tolerance_mm]] = True
 
     centre = corners[near].mean(axis=1)
     bulge = np.linalg.norm(_on_surface(centre, arrays) - centre, axis=1)
     slope = np.abs(np.einsum("fk,fk->f", centre, facet[near])) / np.linalg.norm(centre, axis=1)
     bent = np.flatnonzero(near)[bulge * np.maximum(slope, FLATTEST) > tolerance_mm]
-    marked.append(of_some[bent, length[bent].argmax(axis=1)])
-    split = np.unique(np.concatenate(marked))
+    marked[of_some[bent, length[bent].argmax(axis=1)]] = True
+    split = np.flatnonzero(marked)
     return of_face, split, middles[split]
 
 
