@@ -2,36 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import numpy as np
 
+from hhsr.fitting.quantise import rounded_plane
 from hhsr.fitting.solid import Region, Solid, everywhere
 from hhsr.kernels.lookahead import best_centres, misfits
-from hhsr.model import FloatArray, IntArray, fibonacci_sphere
+from hhsr.model import MAX_DEPTH, Cut, FloatArray, IntArray, Node, RetainedPart, fibonacci_sphere, frozen
 
-DIRECTIONS = 48
-OFFSETS = 13
+DIRECTIONS = 40
+OFFSETS = 11
 CENTRES = 12
-COARSE = 2500
+COARSE = 2000
 LEAST_SHARE = 0.004
+_NOTHING = RetainedPart(frozen(np.zeros((0, 3))), frozen(np.zeros((0, 3)), np.int64))
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A part of the source: its region, (m,) samples, centre and misfit (mm · samples)."""
+    """A part of the solid: its region, (m,) samples, centre, misfit (mm · samples) and how many cuts lead to it."""
 
     region: Region
     members: IntArray
     centre: FloatArray
     misfit: float
+    depth: int
 
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """A cut of a piece and what it makes of it."""
+    """A cut of a piece, its plane as stored, and what it makes of it."""
 
-    normal: FloatArray
+    angles: FloatArray
     offset: float
     left: Piece
     right: Piece
@@ -43,132 +48,186 @@ class Split:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One step of the parting: piece number `piece` is replaced by the split's left, and its right is appended."""
+    """One step of a parting: piece number `piece` is replaced by the split's left, and its right is appended."""
 
     piece: int
     split: Split
 
 
-def whole(solid: Solid, power: float) -> Piece:
-    """Return the source uncut, with its best centre."""
-    members = np.arange(solid.samples.points.shape[0])
-    centre, misfit = best_centre(solid, members, everywhere(), power)
-    return Piece(everywhere(), members, centre, misfit)
+class Parting:
+    """A solid cut into ever more pieces, each cut the one that lowers the misfit the most; made as it is asked for."""
+
+    def __init__(self, solid: Solid, power: float = 1.0) -> None:
+        self._solid = solid
+        self._power = power
+        members = np.arange(solid.samples.points.shape[0])
+        centre, misfit = best_centre(solid, members, everywhere(), power)
+        self._pieces = [[Piece(everywhere(), members, centre, misfit, 0)]]
+        self._steps: list[Step] = []
+        self._offers: list[Split | Literal["unknown"] | None] = ["unknown"]
+
+    def grown(self, count: int) -> bool:
+        """Cut until there are `count` pieces; return whether there are."""
+        while len(self._pieces) < count:
+            if not self._cut():
+                return False
+        return True
+
+    def pieces(self, count: int) -> list[Piece]:
+        """Return the pieces when there were `count`."""
+        return self._pieces[count - 1]
+
+    def misfit(self, count: int) -> float:
+        """Return the summed misfit of `count` pieces, mm · samples."""
+        return sum(piece.misfit for piece in self._pieces[count - 1])
+
+    def tree(self, leaves: Sequence[Node]) -> Node:
+        """Return the tree of as many pieces as there are leaves, given in the order of `pieces`."""
+        slots: list[Node] = list(leaves)
+        for step in reversed(self._steps[: len(leaves) - 1]):
+            right = slots.pop()
+            slots[step.piece] = Cut(step.split.angles, step.split.offset, 0.0, (), slots[step.piece], right)
+        return slots[0]
+
+    def _cut(self) -> bool:
+        """Make the next cut; return whether there was one."""
+        current = self._pieces[-1]
+        for k, piece in enumerate(current):
+            if self._offers[k] == "unknown":
+                self._offers[k] = best_split(self._solid, piece, self._power)
+        falls = [_fall(piece, offer) for piece, offer in zip(current, self._offers, strict=True)]
+        at = int(np.argmax(falls))
+        split = self._offers[at]
+        if not isinstance(split, Split) or falls[at] <= 0.0:
+            return False
+        self._steps.append(Step(at, split))
+        self._pieces.append([*current[:at], split.left, *current[at + 1 :], split.right])
+        self._offers[at] = "unknown"
+        self._offers.append("unknown")
+        return True
 
 
-def parting(solid: Solid, pieces: int, power: float = 1.0) -> tuple[Piece, list[Step]]:
-    """Return the uncut piece and up to pieces − 1 steps, each the split that lowers the misfit the most."""
-    first = whole(solid, power)
-    current = [first]
-    offers: list[Split | None] = [best_split(solid, first, power)]
-    steps: list[Step] = []
-    while len(current) < pieces:
-        gains = [p.misfit - s.misfit if s is not None else -np.inf for p, s in zip(current, offers, strict=True)]
-        at = int(np.argmax(gains))
-        split = offers[at]
-        if split is None or gains[at] <= 0.0:
-            break
-        steps.append(Step(at, split))
-        current[at] = split.left
-        current.append(split.right)
-        offers[at] = best_split(solid, split.left, power)
-        offers.append(best_split(solid, split.right, power))
-    return first, steps
+def _fall(piece: Piece, offer: Split | Literal["unknown"] | None) -> float:
+    """Return by how much a split lowers a piece's misfit; −inf where there is none."""
+    return piece.misfit - offer.misfit if isinstance(offer, Split) else -np.inf
 
 
 def best_centre(solid: Solid, members: IntArray, region: Region, power: float) -> tuple[FloatArray, float]:
-    """Return the point inside the solid and the region from which the members look most like a radius, and the misfit."""
+    """Return the point inside the solid and the region from which the members look most like a radius, and the misfit.
+
+    The misfit is the sum over all members, in mm (for power 1), from the few that are looked at.
+    """
     inner = np.flatnonzero(region.holds(solid.inner))
-    points, normals = solid.samples.points, solid.samples.normals
-    if inner.size == 0:
-        inner = np.array([int(((solid.inner - points[members].mean(axis=0)) ** 2).sum(axis=1).argmin())])
-    tried = inner[_spread(solid.inner[inner], solid.depth[inner], 4 * CENTRES)]
     few = members[:: max(members.size // COARSE, 1)]
-    best = tried[int(misfits(points, normals, few, solid.inner[tried], power).argmin())]
-    near = inner[np.argsort(((solid.inner[inner] - solid.inner[best]) ** 2).sum(axis=1), kind="stable")[: 2 * CENTRES]]
-    values = misfits(points, normals, members, solid.inner[near], power)
-    return solid.inner[near[int(values.argmin())]], float(values.min())
+    if inner.size == 0:
+        middle = solid.samples.points[members].mean(axis=0)
+        inner = np.array([int(((solid.inner - middle) ** 2).sum(axis=1).argmin())])
+    tried = inner[_spread(solid.inner[inner], solid.depth[inner], CENTRES)]
+    for _ in range(2):
+        values = _misfits(solid, few, solid.inner[tried], power)
+        best = tried[int(values.argmin())]
+        least = float(values.min())
+        near = np.argsort(((solid.inner[inner] - solid.inner[best]) ** 2).sum(axis=1), kind="stable")
+        tried = inner[near[: inner.size // CENTRES + 1 : max(inner.size // CENTRES**2, 1)]][:CENTRES]
+        if best not in tried:
+            tried = np.append(tried, best)
+    return solid.inner[best], least * members.size / few.size
+
+
+def _misfits(solid: Solid, few: IntArray, centres: FloatArray, power: float) -> FloatArray:
+    """Return the misfit of some members from each of (c, 3) centres."""
+    gaps = hidden(solid, centres, few)
+    return misfits(solid.samples.points, solid.samples.normals, few, gaps, centres, power)
+
+
+def hidden(solid: Solid, centres: FloatArray, members: IntArray) -> FloatArray:
+    """Return (c, m) how far (mm) each member lies behind the first surface that a centre sees; 0 where it is seen."""
+    points = solid.samples.points[members]
+    offset = points[None, :, :] - centres[:, None, :]
+    r = np.sqrt((offset**2).sum(axis=2))
+    directions = (offset / np.maximum(r, 1e-12)[:, :, None]).reshape(-1, 3)
+    hit, _ = solid.triangles.first_hit(np.repeat(centres, members.size, axis=0), directions)
+    gap = r - np.where(np.isfinite(hit), hit, np.inf).reshape(r.shape)
+    return np.where(gap > 1e-5 * solid.size, gap, 0.0)
 
 
 def best_split(solid: Solid, piece: Piece, power: float) -> Split | None:
     """Return the best cut of a piece, or None where neither side could have a centre."""
     least = max(int(LEAST_SHARE * solid.samples.points.shape[0]), 8)
-    if piece.members.size < 2 * least:
+    if piece.members.size < 2 * least or piece.depth >= MAX_DEPTH:
         return None
     inner = np.flatnonzero(piece.region.holds(solid.inner))
     if inner.size < 2:
         return None
     chosen = solid.inner[inner[_spread(solid.inner[inner], solid.depth[inner], CENTRES)]]
     few = piece.members[:: max(piece.members.size // COARSE, 1)]
-    directions = fibonacci_sphere(2 * DIRECTIONS)[:DIRECTIONS]
-    normal, offset, value = _best_plane(
-        solid, few, chosen, directions, None, least * few.size / piece.members.size, power
-    )
+    view = _View(solid, few, hidden(solid, chosen, few), chosen, least * few.size / piece.members.size, power)
+    normal, offset, value = view.best_plane(fibonacci_sphere(2 * DIRECTIONS)[:DIRECTIONS], None, None)
     spread = float(np.ptp(solid.samples.points[few], axis=0).max())
     angle = 0.25
     for _ in range(3):
-        around = _around(normal, angle)
-        normal_, offset_, value_ = _best_plane(
-            solid,
-            few,
-            chosen,
-            around,
-            offset + 0.5 * angle * spread * np.linspace(-0.5, 0.5, 7),
-            least * few.size / piece.members.size,
-            power,
-            pivot=solid.samples.points[few].mean(axis=0),
-            old=normal,
-        )
-        if value_ < value:
-            normal, offset, value = normal_, offset_, value_
+        shifts = offset + 0.5 * angle * spread * np.linspace(-0.5, 0.5, 5)
+        turned = view.best_plane(_around(normal, angle), shifts, normal)
+        if turned[2] < value:
+            normal, offset, value = turned
         angle *= 0.5
     if not np.isfinite(value):
         return None
     return split_by(solid, piece, normal, offset, power)
 
 
+class _View(NamedTuple):
+    """What a cut is judged by: (m,) members, (c, m) what is hidden of them from (c, 3) centres."""
+
+    solid: Solid
+    members: IntArray
+    gaps: FloatArray
+    centres: FloatArray
+    least: float
+    power: float
+
+    def best_plane(
+        self, directions: FloatArray, offsets: FloatArray | None, old: FloatArray | None
+    ) -> tuple[FloatArray, float, float]:
+        """Return the plane with the least misfit of both sides: normal, offset, misfit.
+
+        offsets: along the old normal; a turned plane keeps its height over the members' mean. None: even shares.
+        """
+        points, normals = self.solid.samples.points, self.solid.samples.normals
+        own = points[self.members]
+        heights = np.einsum("di,ni->dn", directions, own)
+        if offsets is None or old is None:
+            planes = np.quantile(heights, np.linspace(0.0, 1.0, OFFSETS + 2)[1:-1], axis=1).T.copy()
+        else:
+            planes = np.einsum("di,i->d", directions - old, own.mean(axis=0))[:, None] + offsets[None, :]
+        across = np.einsum("di,ci->dc", directions, self.centres)
+        value, _ = best_centres(
+            points, normals, self.members, self.gaps, heights, planes, self.centres, across, self.power
+        )
+        count = (heights[:, None, :] < planes[:, :, None]).sum(axis=2)
+        total = value.sum(axis=2)
+        total[(count < self.least) | (self.members.size - count < self.least)] = np.inf
+        d, k = np.unravel_index(int(total.argmin()), total.shape)
+        return directions[d], float(planes[d, k]), float(total[d, k])
+
+
 def split_by(solid: Solid, piece: Piece, normal: FloatArray, offset: float, power: float) -> Split | None:
     """Return a piece cut by a plane, with the best centre of either side; None where a side is empty."""
+    angles, offset = rounded_plane(normal, offset, solid.size)
+    normal = normal_of(angles)
     heights = np.einsum("ni,i->n", solid.samples.points[piece.members], normal)
     below, above = piece.region.halves(normal, offset)
     sides = []
     for region, members in ((below, piece.members[heights < offset]), (above, piece.members[heights >= offset])):
         if members.size < 8:
             return None
-        sides.append(Piece(region, members, *best_centre(solid, members, region, power)))
-    return Split(normal, offset, sides[0], sides[1])
+        sides.append(Piece(region, members, *best_centre(solid, members, region, power), piece.depth + 1))
+    return Split(angles, offset, sides[0], sides[1])
 
 
-def _best_plane(
-    solid: Solid,
-    members: IntArray,
-    centres: FloatArray,
-    directions: FloatArray,
-    offsets: FloatArray | None,
-    least: float,
-    power: float,
-    pivot: FloatArray | None = None,
-    old: FloatArray | None = None,
-) -> tuple[FloatArray, float, float]:
-    """Return the plane with the least misfit of both sides: normal, offset, misfit.
-
-    offsets: along the old normal; a turned plane keeps its height over the pivot. None: even shares of the members.
-    """
-    points, normals = solid.samples.points, solid.samples.normals
-    heights = np.einsum("di,ni->dn", directions, points[members])
-    if offsets is None:
-        planes = np.quantile(heights, np.linspace(0.0, 1.0, OFFSETS + 2)[1:-1], axis=1).T.copy()
-    else:
-        assert pivot is not None and old is not None
-        shift = np.einsum("di,i->d", directions - old, pivot)
-        planes = shift[:, None] + offsets[None, :]
-    inner_heights = np.einsum("di,ci->dc", directions, centres)
-    value, _ = best_centres(points, normals, members, heights, planes, centres, inner_heights, power)
-    count = (heights[:, None, :] < planes[:, :, None]).sum(axis=2)
-    total = value.sum(axis=2)
-    total[(count < least) | (members.size - count < least)] = np.inf
-    d, k = np.unravel_index(int(total.argmin()), total.shape)
-    return directions[d], float(planes[d, k]), float(total[d, k])
+def normal_of(angles: FloatArray) -> FloatArray:
+    """Return the (3,) unit normal of a plane's azimuth and elevation, as `hhsr.model.Cut` has it."""
+    return np.asarray(Cut(angles, 0.0, 0.0, (), _NOTHING, _NOTHING).normal)
 
 
 def _around(normal: FloatArray, angle: float) -> FloatArray:

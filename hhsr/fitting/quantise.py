@@ -8,11 +8,22 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hhsr.model import Contour, Cut, FloatArray, ModelLeaf, Node, RetainedPart, ScaleField, frozen, leaves
+from hhsr.model import (
+    Contour,
+    Cut,
+    FloatArray,
+    ModelLeaf,
+    Node,
+    RetainedPart,
+    ScaleField,
+    frozen,
+    leaves,
+    normal_angles_of,
+)
 
 LENGTH_BITS = 15
 VERTEX_BITS = 18
-WEIGHT_BITS = 9
+WEIGHT_BITS = 10
 ANGLE_STEP = 2.0**-14
 LOGIT_STEP = 2.0**-8
 
@@ -28,6 +39,15 @@ def quantised(root: Node, weight_bits: int = WEIGHT_BITS) -> Node:
     weights = [np.asarray(w) for w in _weights(root)]
     step = weight_step(np.concatenate(weights) if weights else np.zeros(0), weight_bits)
     return _rounded(root, _power_below(longest), step)
+
+
+def rounded_plane(normal: FloatArray, offset: float, size: float) -> tuple[FloatArray, float]:
+    """Return a plane's angles (2,) and offset (mm) as the file will keep them, for a shape of a longest side (mm).
+
+    Cuts are rounded before anything is fitted to their sides, so that rounding opens no step between them.
+    """
+    angles = _multiples(normal_angles_of(normal), ANGLE_STEP)
+    return angles, float(_multiples(offset, _power_below(size) * 2.0 ** (3 - LENGTH_BITS)))
 
 
 def weight_step(weights: FloatArray, bits: int = WEIGHT_BITS) -> float:

@@ -45,7 +45,7 @@ class Task(NamedTuple):
 
 
 class Misses(NamedTuple):
-    """n rows of what a leaf misses: miss (n,) mm, its slope by ρ and by the centre (n, 3), weight (n,) ≥ 0 (squared)."""
+    """n rows of what a leaf misses: miss (n,) mm, its slopes by ρ and by the centre (n, 3), squared weight (n,) ≥ 0."""
 
     directions: FloatArray
     miss: FloatArray
@@ -93,7 +93,7 @@ def hold_rows(task: Task, solid: Solid, half_axes: FloatArray) -> Rows:
 
 
 class _Rays(NamedTuple):
-    """Rays from a centre: (n, 3) directions, (n,) mm to the region's end, cosine there, mm to the first hit, through."""
+    """Rays: (n, 3) directions, (n,) mm to the region's end, cosine there, mm to the first hit, whether through."""
 
     directions: FloatArray
     reach: FloatArray
@@ -128,10 +128,10 @@ def start_rows(task: Task, solid: Solid, centre: FloatArray) -> Rows:
     )
 
 
-def misses(task: Task, solid: Solid, leaf: ModelLeaf, radius: RadiusOf, power: float) -> Misses:
-    """Return what a leaf misses, both ways: samples it should pass through, its own points that should lie on the source.
+def misses(task: Task, solid: Solid, leaf: ModelLeaf, radius: RadiusOf, power: float, held: bool = True) -> Misses:
+    """Return what a leaf misses, both ways: samples that it should meet, its own points that should lie on the source.
 
-    power: of the misses whose sum is to fall (2: least squares, 1: their mean).
+    power: of the misses whose sum is to fall (2: least squares, 1: their mean). held: with the weak rows behind cuts.
     """
     share, behind = (4.0 * np.pi / count / solid.sample_area for count in (RAYS, BOUND_RAYS))
     offset = task.points[task.seen] - leaf.centre
@@ -148,8 +148,8 @@ def misses(task: Task, solid: Solid, leaf: ModelLeaf, radius: RadiusOf, power: f
     free = task.directions[~t]
     reach = radius(free)
     ends = leaf.centre + reach[:, None] * free
-    held = task.region.holds(ends)
-    free, reach, ends = free[held], reach[held], ends[held]
+    within = task.region.holds(ends)
+    free, reach, ends = free[within], reach[within], ends[within]
     distance, nearest, face = solid.triangles.closest(ends)
     corner = solid.vertices[solid.faces[face]]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -169,7 +169,7 @@ def misses(task: Task, solid: Solid, leaf: ModelLeaf, radius: RadiusOf, power: f
     held_miss = fell + task.bound[t] - base
     held_weight = np.where(fell < 0.0, 0.0, behind * (HOLD * task.bound[t]) ** 2)
     fell = np.where(fell < 0.0, fell, held_miss)
-    fell_weight = np.maximum(fell_weight, held_weight)
+    fell_weight = np.maximum(fell_weight, held_weight) if held else fell_weight
     miss = np.concatenate([own, away])
     typical = max(float(np.abs(miss).mean()), 1e-9 * solid.size)
     robust = np.maximum(np.abs(miss) / typical, 0.5) ** (power - 2.0)
@@ -222,14 +222,25 @@ def mending_rows(solid: Solid, task: Task, leaf: ModelLeaf, power: float = 2.0) 
     return as_rows(found, radius(found.directions))
 
 
-def loss(solid: Solid, task: Task, leaf: ModelLeaf) -> float:
-    """Return the sum of what a leaf misses, mm · samples, half of either way; unseen samples by their own distance."""
-    found = misses(task, solid, leaf, RadiusOf(leaf), 2.0)
-    total = float((np.abs(found.miss) * found.weight).sum())
+class Figures(NamedTuple):
+    """Sum of what a leaf misses, mm · samples, half of either way; the largest miss, mm; how many samples it hides."""
+
+    total: float
+    largest: float
+    unseen: int
+
+
+def figures(solid: Solid, task: Task, leaf: ModelLeaf) -> Figures:
+    """Return how a leaf fits; samples that its centre does not see count by their distance along the ray."""
+    radius = RadiusOf(leaf)
+    found = misses(task, solid, leaf, radius, 2.0, held=False)
     unseen = task.points[~task.seen] - leaf.centre
     r = np.sqrt((unseen**2).sum(axis=1))
-    rho = RadiusOf(leaf)(unseen / np.maximum(r, 1e-12)[:, None])
-    return 0.5 * (total + float(np.abs(rho - r).sum()))
+    hidden = np.abs(radius(unseen / np.maximum(r, 1e-12)[:, None]) - r)
+    miss = np.abs(found.miss)
+    total = 0.5 * (float((miss * found.weight).sum()) + float(hidden.sum()))
+    largest = max(float(miss[found.weight > 0.0].max(initial=0.0)), float(hidden.max(initial=0.0)))
+    return Figures(total, largest, r.size)
 
 
 def improved(solid: Solid, task: Task, leaf: ModelLeaf, steps: int, power: float) -> ModelLeaf:

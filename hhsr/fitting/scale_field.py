@@ -39,7 +39,7 @@ class Selection(NamedTuple):
 
 
 def grid_for(finest: int) -> CentreGrid:
-    """Return the dictionary whose finest grid has about `finest` centres; each coarser one is spaced 1.6 times wider."""
+    """Return the dictionary whose finest grid has about `finest` centres; each coarser one is 1.6 times wider."""
     sizes = [max(finest, COARSEST)]
     while sizes[-1] / RATIO**2 >= COARSEST:
         sizes.append(round(sizes[-1] / RATIO**2))

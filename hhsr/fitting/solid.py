@@ -31,7 +31,7 @@ class Region(NamedTuple):
         return below, above
 
     def exits(self, origin: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (n,) how far rays from a point of the region run in it, and (n,) the cosine at the plane they leave by."""
+        """Return (n,) how far rays from a point of the region run in it, and (n,) their cosine at its end."""
         reach = np.full(directions.shape[0], np.inf)
         cosine = np.ones(directions.shape[0])
         for normal, offset in zip(self.normals, self.offsets, strict=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from itertools import pairwise
 
 import numpy as np
 
@@ -46,5 +47,5 @@ def _falling(gains: FloatArray) -> FloatArray:
         ) * (k - hull[-1]):
             hull.pop()
         hull.append(k)
-    slopes = [(total[b] - total[a]) / (b - a) for a, b in zip(hull[:-1], hull[1:], strict=True)]
+    slopes = [(total[b] - total[a]) / (b - a) for a, b in pairwise(hull)]
     return np.repeat(slopes, np.diff(hull))

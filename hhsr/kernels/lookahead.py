@@ -12,12 +12,19 @@ GRAZING = 0.2
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(points, normals, first, last, order, heights, plane_offset, side, cx, cy, cz, sums):
-    """Add the members of one side of a plane, seen from a centre, to the sums of their cells of directions."""
+def _accumulate(points, normals, order, gaps, heights, plane_offset, side, cx, cy, cz, sums):
+    """Add the members of one side of a plane that a centre sees to the sums of their cells of directions.
+
+    Returns what the members cost that it does not see.
+    """
     sums[:] = 0.0
-    for at in range(first, last):
+    hidden = 0.0
+    for at in range(order.shape[0]):
         i = order[at]
         if side != 0 and (heights[at] - plane_offset) * side < 0.0:
+            continue
+        if gaps[at] > 0.0:
+            hidden += gaps[at]
             continue
         x, y, z = points[i, 0] - cx, points[i, 1] - cy, points[i, 2] - cz
         r = math.sqrt(x * x + y * y + z * z) + 1e-12
@@ -48,6 +55,7 @@ def _accumulate(points, normals, first, last, order, heights, plane_offset, side
         s[7] += w * a * r
         s[8] += w * b * r
         s[9] += w * r * r
+    return hidden
 
 
 @njit(cache=True, nogil=True)
@@ -74,10 +82,11 @@ def _misfit_of_cells(sums, power):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def best_centres(points, normals, order, heights, offsets, candidates, candidate_heights, power):
+def best_centres(points, normals, order, gaps, heights, offsets, candidates, candidate_heights, power):
     """Look at each cut of one part: the least misfit of either side over the candidate centres that lie in it.
 
-    points, normals: (n, 3). order: (m,) the part's members. heights: (d, m) of the members along each direction.
+    points, normals: (n, 3). order: (m,) the part's members. gaps: (c, m) what a member costs that a centre
+    does not see, 0 where it sees it. heights: (d, m) of the members along each direction.
     offsets: (d, k) planes along each direction. candidates: (c, 3) centres inside the solid and the part;
     candidate_heights: (d, c). Returns (d, k, 2) misfits, left (below) and right, inf where a side holds no centre,
     and (d, k, 2) which centre.
@@ -93,12 +102,11 @@ def best_centres(points, normals, order, heights, offsets, candidates, candidate
             for c in range(candidates.shape[0]):
                 if (candidate_heights[d, c] - offsets[d, k]) * side <= 0.0:
                     continue
-                _accumulate(
+                hidden = _accumulate(
                     points,
                     normals,
-                    0,
-                    order.shape[0],
                     order,
+                    gaps[c],
                     heights[d],
                     offsets[d, k],
                     side,
@@ -107,7 +115,7 @@ def best_centres(points, normals, order, heights, offsets, candidates, candidate
                     candidates[c, 2],
                     sums,
                 )
-                value = _misfit_of_cells(sums, power)
+                value = hidden + _misfit_of_cells(sums, power)
                 if value < misfit[d, k, s]:
                     misfit[d, k, s] = value
                     which[d, k, s] = c
@@ -115,13 +123,13 @@ def best_centres(points, normals, order, heights, offsets, candidates, candidate
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def misfits(points, normals, order, candidates, power):
+def misfits(points, normals, order, gaps, candidates, power):
     """Return (c,) the misfit of one part, whole, seen from each candidate centre."""
     out = np.empty(candidates.shape[0])
     heights = np.zeros(order.shape[0])
     for c in prange(candidates.shape[0]):
         sums = np.zeros((CELLS, SUMS))
         x, y, z = candidates[c, 0], candidates[c, 1], candidates[c, 2]
-        _accumulate(points, normals, 0, order.shape[0], order, heights, 0.0, 0, x, y, z, sums)
-        out[c] = _misfit_of_cells(sums, power)
+        hidden = _accumulate(points, normals, order, gaps[c], heights, 0.0, 0, x, y, z, sums)
+        out[c] = hidden + _misfit_of_cells(sums, power)
     return out

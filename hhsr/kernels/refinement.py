@@ -1,7 +1,5 @@
 """Gauss-Newton on a leaf: its radii and their slopes for the chosen centres, and the normal equations (DESIGN §3)."""
 
-import math
-
 import numpy as np
 from numba import njit
 

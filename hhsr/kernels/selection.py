@@ -23,8 +23,8 @@ def _row_of_dictionary(ux, uy, uz, centres, starts, extents, index, value, at):
         support = math.acos(max(1.0 - extent, -1.0))
         top = 1.0 if polar <= support else math.cos(polar - support)
         bottom = -1.0 if polar + support >= math.pi else math.cos(polar + support)
-        low = max(int(math.floor(0.5 * (1.0 - top) * count - 0.5)), 0)
-        high = min(int(math.ceil(0.5 * (1.0 - bottom) * count - 0.5)), count - 1)
+        low = max(math.floor(0.5 * (1.0 - top) * count - 0.5), 0)
+        high = min(math.ceil(0.5 * (1.0 - bottom) * count - 0.5), count - 1)
         for j in range(first + low, first + high + 1):
             h = (1.0 - (ux * centres[j, 0] + uy * centres[j, 1] + uz * centres[j, 2])) / extent
             if h < 1.0:
@@ -92,7 +92,6 @@ def orthogonal_selection(pointer, index, value, scale, target, columns, count, r
     Returns (k,) atoms in order, (k,) falls of the sum of squares, (k, k) lower triangle L of the chosen atoms' normal
     matrix and (k,) y with L y = right side, so that the weights of the first m solve L[:m, :m]ᵀ w = y[:m].
     """
-    n = pointer.shape[0] - 1
     starts, rows, values = transposed(pointer, index, value, columns)
     diagonal = np.zeros(columns)
     pull = np.zeros(columns)
