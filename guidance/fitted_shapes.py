@@ -5,9 +5,14 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from guidance.errors import SceneError
@@ -44,11 +49,17 @@ class ShapeSource:
         state.update(self.file.read_bytes())
         return state.hexdigest()[:16]
 
+    @property
+    def kept_name(self) -> str:
+        """File name of the fitted shape: readable, and another one when source or options change."""
+        plain = "".join(c if c.isalnum() or c in "-_" else "_" for c in self.name)
+        return f"{plain}-{self.digest()}.hhsr"
+
 
 def fitted_shapes(
     sources: Sequence[ShapeSource], folder: Path, progress: Callable[[str, Any], None] | None = None
 ) -> dict[str, Shape]:
-    """Load or fit every source.
+    """Load or fit every source; fits of models run side by side in processes of their own.
 
     Parameters
     ----------
@@ -64,47 +75,100 @@ def fitted_shapes(
         If a source cannot be read or fitted, naming it and the reason.
     """
     shapes: dict[str, Shape] = {}
-    for source in sources:
-        shapes[source.name] = _shape(source, folder)
+
+    def ready(source: ShapeSource, shape: Shape) -> None:
+        shapes[source.name] = shape
         if progress is not None:
-            progress(source.name, shapes[source.name])
-    return shapes
+            progress(source.name, shape)
+
+    to_fit = []
+    for source in sources:
+        kept = _kept(source, folder)
+        if kept is None:
+            to_fit.append(source)
+        else:
+            ready(source, kept)
+    models = sorted((s for s in to_fit if not s.retain), key=_effort, reverse=True)
+    apart = models if len(models) > 1 and _cores() > 1 else []
+    with ThreadPoolExecutor(_cores()) as pool, TemporaryDirectory() as room:
+        fits = {pool.submit(_fit_apart, s, Path(room) / f"{k}.hhsr"): s for k, s in enumerate(apart)}
+        try:
+            for source in (s for s in to_fit if s not in apart):
+                ready(source, _keep(source, _fit(source), folder))
+            for done in as_completed(fits):
+                ready(fits[done], _keep(fits[done], done.result(), folder))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return {s.name: shapes[s.name] for s in sources}
 
 
-def _shape(source: ShapeSource, folder: Path) -> Shape:
+def _effort(source: ShapeSource) -> float:
+    """What a fit will cost, roughly, so that the longest starts first."""
+    return float(source.max_parameters or 0) * source.file.stat().st_size
+
+
+def _cores() -> int:
+    return os.cpu_count() or 1
+
+
+def _kept(source: ShapeSource, folder: Path) -> Shape | None:
+    """The shape of a source that needs no fit: given as one, or fitted before."""
     import hhsr
 
-    try:
-        if source.ready:
+    if source.ready:
+        try:
             return hhsr.load(source.file)
-        kept = folder / f"{_file_name(source.name)}-{source.digest()}.hhsr"
-        if kept.is_file():
-            with contextlib.suppress(hhsr.HhsrError):  # a damaged or older file: fit again
-                return hhsr.load(kept)
-        shape = _fit(source)
-    except (hhsr.HhsrError, OSError) as error:
-        raise SceneError(f"structure {source.name!r} ({source.file.name}): {error}") from error
+        except (hhsr.HhsrError, OSError) as error:
+            raise SceneError(f"structure {source.name!r} ({source.file.name}): {error}") from error
+    kept = folder / source.kept_name
+    if kept.is_file():
+        with contextlib.suppress(hhsr.HhsrError):  # a damaged or older file: fit again
+            return hhsr.load(kept)
+    return None
+
+
+def _keep(source: ShapeSource, shape: Shape, folder: Path) -> Shape:
     with contextlib.suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / ".gitignore").write_text("*\n", encoding="utf-8")
-        shape.save(kept)
+        shape.save(folder / source.kept_name)
     return shape
 
 
 def _fit(source: ShapeSource) -> Shape:
+    """Fit in this process."""
     import hhsr
 
-    options: dict[str, Any] = {}
-    if source.retain:
-        options["retain"] = True
+    options: dict[str, Any] = {"retain": source.retain}
     if source.max_parameters is not None:
         options["max_parameters"] = source.max_parameters
-    reading: dict[str, Any] = {"force": source.force}
-    for key in ("frame", "unit", "label"):
-        if getattr(source, key) is not None:
-            reading[key] = getattr(source, key)
-    return hhsr.fit(hhsr.read_surface(source.file, **reading), hhsr.FitOptions(**options))
+    reading: dict[str, Any] = {"frame": source.frame, "unit": source.unit, "label": source.label}
+    try:
+        surface = hhsr.read_surface(source.file, force=source.force, **reading)
+        return hhsr.fit(surface, hhsr.FitOptions(**options))
+    except (hhsr.HhsrError, OSError) as error:
+        raise SceneError(f"structure {source.name!r} ({source.file.name}): {error}") from error
 
 
-def _file_name(name: str) -> str:
-    return "".join(c if c.isalnum() or c in "-_" else "_" for c in name)
+def _fit_apart(source: ShapeSource, out: Path) -> Shape:
+    """Fit by the command `hhsr fit` in a process of its own: fits hold the interpreter, threads would wait."""
+    import hhsr
+
+    command = [sys.executable, "-c", "from hhsr.cli import app; app()", "fit", str(source.file), "-o", str(out)]
+    for flag, value in (
+        ("--frame", source.frame),
+        ("--unit", source.unit),
+        ("--label", source.label),
+        ("--max-parameters", source.max_parameters),
+    ):
+        if value is not None:
+            command += [flag, str(value)]
+    if source.force:
+        command.append("--force")
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        said = (done.stderr.strip() or done.stdout.strip()).splitlines()
+        reason = " ".join(line.strip() for line in said[-6:])
+        raise SceneError(f"structure {source.name!r} ({source.file.name}): {reason or 'hhsr fit failed'}")
+    return hhsr.load(out)
