@@ -123,6 +123,8 @@ class IgtlTracker(Tracker):
         self._number = -1
         #: messages received, of any kind, and those of kinds that hold no poses
         self.messages = self.other_messages = 0
+        #: header timestamp of the last frame made, Unix time; 0 where the sender gives none
+        self.last_stamp_s = 0.0
 
     @property
     def tool_names(self) -> tuple[str, ...]:
@@ -217,6 +219,7 @@ class IgtlTracker(Tracker):
 
     def _close_group(self) -> None:
         tools, stamp_s, repeated = self._groups.take()
+        self.last_stamp_s = stamp_s
         self._names.update(dict.fromkeys(tools))
         self.counters.repeated += repeated
         self._number += not repeated

@@ -291,8 +291,8 @@ class NdiTracker(Tracker):
             raise error
 
     def _plan_next(self, arrival_s: float, new: bool) -> None:
-        """Ask again shortly before the next frame is due; where it was not there yet, a little later."""
-        self._next_poll_s = arrival_s + (0.85 if new else 0.05) * self._period_s
+        """Ask again half a frame later, and where nothing new was there, a little later: no stall must cost a frame."""
+        self._next_poll_s = arrival_s + (0.5 if new else 0.05) * self._period_s
 
     def _plug_in(self, now_s: float) -> None:
         """A tool was plugged in: it must be initialised and enabled, which is possible only while not tracking."""
