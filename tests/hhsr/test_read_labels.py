@@ -16,6 +16,7 @@ from hhsr.read.iso_surface import surface_of_mask
 from hhsr.read.topology import edge_counts
 
 LPS_OF_RAS = np.diag([-1.0, -1.0, 1.0])
+Triple = tuple[float, float, float]
 
 
 def turned(
