@@ -115,7 +115,7 @@ def _open_sim(url: str, place: str, parameters: Parameters, clock: Clock | None)
 
 
 def _open_replay(url: str, place: str, parameters: Parameters, clock: Clock | None) -> Tracker:
-    values = _taken(url, parameters, {"rate": lambda text: None if text in ("step", "none") else float(text)})
+    values = _taken(url, parameters, {"rate": lambda text: None if text.lower() in ("step", "none") else float(text)})
     return ReplayTracker(place, clock=clock, **values)
 
 

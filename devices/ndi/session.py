@@ -254,6 +254,19 @@ class Session:
                 return int(found.group(1))
         return 0
 
+    def free_stale(self) -> None:
+        """Free handles of tools that are gone, and of tools that an earlier session loaded."""
+        for handle, _ in decode_handles(self.ask_text("PHSR", "01")):
+            self.order("PHF", f"{handle:02X}", done=_NOT_ALLOCATED)
+        for handle, _ in decode_handles(self.ask_text("PHSR", "00")):
+            try:
+                location = self.ask_text("PHINF", f"{handle:02X}0020")
+            except TrackerError:
+                continue
+            # device (8), system, 0 on a cable or 1 wireless, port (2), channel (2)
+            if len(location) == 14 and location[9] == "1":
+                self.order("PHF", f"{handle:02X}", done=_NOT_ALLOCATED)
+
     def load(self, definition: ToolDefinition) -> int:
         """Load a tool definition into a new port handle, initialise and enable it; return the handle."""
         reply = self.ask("PHRQ", "*********1****")
@@ -271,8 +284,6 @@ class Session:
         Initialising one tool may show another handle (two sensors in one plug), so it is repeated until none waits.
         A tool that cannot be initialised is left out.
         """
-        for handle, _ in decode_handles(self.ask_text("PHSR", "01")):
-            self.order("PHF", f"{handle:02X}", done=_NOT_ALLOCATED)
         found: dict[int, str] = {}
         failed: set[int] = set()
         for _ in range(8):

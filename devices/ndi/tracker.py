@@ -185,6 +185,7 @@ class NdiTracker(Tracker):
         self.mode = self._wanted_mode
         if self.mode == "auto":
             self.mode = "BX2" if session.interface_version() >= 3 else "BX"
+        session.free_stale()
         self._tools = {}
         for name, definition in zip(self._names, self._definitions, strict=True):
             self._tools[session.load(definition)] = name

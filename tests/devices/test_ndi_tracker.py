@@ -226,6 +226,18 @@ def test_a_tool_plugged_in_later_joins() -> None:
         assert frame.tools["BODY-1"].status is ToolStatus.OK
 
 
+def test_what_an_earlier_session_loaded_is_freed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A device that keeps loaded tools through INIT: they must not come back as tools that nobody asked for."""
+    device = Device(SimulatedBodies(1))
+    monkeypatch.setattr(type(device.ports), "initialise_all", lambda ports: None)
+    with TcpEmulator(device) as emulator:
+        for _ in range(2):
+            with NdiTracker(place(emulator), roms=[rom_bytes()], names=["drill"]) as tracker:
+                assert tracker.tool_names == ("drill", "BODY-0")
+                assert tracker.read(2.0) is not None
+    assert sorted(device.ports.handles) == [0x01, 0x0A]
+
+
 def test_an_older_device_falls_back_to_bx() -> None:
     old = Device(SimulatedBodies(1), api_revision="G.001.004")
     with TcpEmulator(old) as emulator, NdiTracker(place(emulator)) as tracker:
