@@ -19,9 +19,9 @@ from hhsr.surface.sources import Patch, Retained, Source, Step, Strip
 from hhsr.surface.tidy import tidy
 from hhsr.surface.trim import trim
 
-# Vertices are on the surface and facets are chords, so all misses point inwards: a share of what was asked keeps the
-# mean far below it (measured: mean radial miss 0.39 of the edge tolerance).
-EDGE_SHARE = 0.5
+# Edges and face centres are held to this share of what was asked. At 0.02 mm a facet then misses by 0.006 mm in the mean
+# and 0.016 at the 99th percentile, and a fit's mean error moves by less than 0.0003 mm (prostate 0.0338, liver 0.353).
+EDGE_SHARE = 0.8
 FURTHEST = 10.0  # tolerances that a vertex may be moved when it is put back onto the exact surfaces
 SHORTEST = 0.01  # tolerances: shorter edges are collapsed at the end
 STORABLE = 2e-4  # mm: ends of shorter edges might become one vertex in a file of 32-bit floats
