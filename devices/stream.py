@@ -124,6 +124,7 @@ class Stream:
     def stop(self) -> None:
         """Stop thread and tracker within 0.5 s, also where the line is silent."""
         self._stopping.set()
+        self.tracker.interrupt()
         thread = self._thread
         if thread is not None:
             thread.join(_JOIN_S)

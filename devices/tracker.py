@@ -88,9 +88,13 @@ class Tracker(ABC):
         self._start()
         self._running = True
 
+    def interrupt(self) -> None:
+        """End a `read` that waits, from any thread; what follows can only be `stop`."""
+        self._stopping.set()
+
     def stop(self) -> None:
         """End tracking and close the device; does nothing where it does not run. Interrupts a `read` that waits."""
-        self._stopping.set()
+        self.interrupt()
         if self._running:
             self._running = False
             self._stop()
