@@ -214,7 +214,7 @@ def _figures(shape: Shape) -> dict[str, Any]:
         "retained": sum(isinstance(part, RetainedPart) for part in parts),
         "depth": depth(shape.tree.root),
         **_error_words(stored.fit_error),
-        "volume_ml": float(shape.mesh(tolerance_mm=0.1).volume) / 1000.0,
+        "volume_ml": _volume_ml(shape),
         "frame": stored.frame,
         "label": stored.label,
         "source_hash": stored.source_hash,
@@ -222,6 +222,12 @@ def _figures(shape: Shape) -> dict[str, Any]:
         "software": stored.software,
         "report": dict(stored.report),
     }
+
+
+def _volume_ml(shape: Shape) -> float:
+    """Return the solid's volume as the fit measured it, else of its mesh."""
+    measured = shape.provenance.report.get("topology", {}).get("volume_ml")
+    return float(measured[1]) if measured else float(shape.mesh(tolerance_mm=0.1).volume) / 1000.0
 
 
 def _error_words(figures: ErrorFigures | None) -> dict[str, float | None]:

@@ -17,8 +17,11 @@ _WORDS = (
     b'"genus":"bodies":"seed":0,"cuts":[{"d":0.0,"lobes":1,"step_area_mm2":"largest_step_mm":"depth":0,"topology":{'
     b'"recipe":"paper","recipe":"default","retain":true,"retain":false,"t_mm":5.0,"t1":0.05,"t2_mm3":0.0,"t3_mm":7.0,'
     b'"volume_ml":"source_volume_ml":"extent_mm":"max_parameters":null,"max_error_mm":null,"max_mean_error_mm":null,'
-    b'{"frame":"LSA","label":null,"options":{},"report":{},"software":"hhsr-guidance 0.1.0"}'
-    b'{"frame":"RAS","label":1,{"frame":"LPS","label":null,"options":{"max_parameters":'
+    b'{"kind":"retained","vertices":,"faces":}{"half_width_mm":0.0,"lobes":1,"step_area_mm2":0.0,"largest_step_mm":'
+    b'"bodies":[1,1],"genus":[0,0],"leaves":[{"kind":"model","parameters":'
+    b'{"frame":"RAS","label":1,"options":{"max_parameters":320},"report":{"cuts":[],"topology":{"bodies":[1,1],"genus":'
+    b'[0,0],"volume_ml":["leaves":[{"kind":"model","parameters":"software":"hhsr-guidance 0.1.0"}'
+    b'{"frame":"LSA","label":null,"options":{},{"frame":"LPS","label":null,"options":{"max_parameters":'
 )
 _MAX_HEADER = 1 << 20
 _HASH_SIZE = 32

@@ -6,6 +6,7 @@ block for each array, so a few numbers per leaf do not each pay for a head.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hhsr.errors import FileFormatError
-from hhsr.io.blocks import FloatArray, Reader, Writer, float_block
+from hhsr.io.blocks import FloatArray, IntArray, Reader, Writer, float_block
 from hhsr.io.subset import rank_of_subset, subset_bytes, subset_of_rank
 from hhsr.model import (
     MAX_DEPTH,
@@ -93,8 +94,7 @@ def write_tree(writer: Writer, tree: Tree) -> None:
     ):
         _write_column(writer, column)
     for field in fields:
-        total, chosen = field.grid.size, field.index.size
-        writer.raw(rank_of_subset(field.index, total).to_bytes(subset_bytes(total, chosen), "big"))
+        writer.raw(min(_whole_choice(field), _choice_by_level(field), key=len))
     for part in parts:
         writer.integers(part.faces.ravel(), len(part.vertices))
 
@@ -183,6 +183,28 @@ def read_tree(reader: Reader) -> Tree:
     return Tree(assemble(shape), frozen(np.concatenate([rotation, translation])))
 
 
+def _whole_choice(field: ScaleField) -> bytes:
+    """Return a layout byte and which centres are used as one number below C(all centres, used)."""
+    return bytes([_TOGETHER]) + _rank(field.index, field.grid.size)
+
+
+def _choice_by_level(field: ScaleField) -> bytes:
+    """Return a layout byte, and how many and which centres of each level: shorter, as coarse levels are used more."""
+    writer = Writer()
+    writer.varint(_EACH)
+    first = 0
+    for size in field.grid.sizes:
+        inside = field.index[(field.index >= first) & (field.index < first + size)] - first
+        writer.varint(inside.size)
+        writer.raw(_rank(inside, size))
+        first += size
+    return writer.written()
+
+
+def _rank(index: IntArray, total: int) -> bytes:
+    return rank_of_subset(index, total).to_bytes(subset_bytes(total, index.size), "big")
+
+
 def _count(reader: Reader) -> int:
     """Return a count of things of which each takes a byte at least."""
     count = reader.varint()
@@ -217,14 +239,29 @@ def _flat(node: _Shape) -> Iterator[_Shape]:
 
 
 def _read_field(reader: Reader, grid: CentreGrid, weights: FloatArray) -> ScaleField:
-    total, chosen = grid.size, weights.size
+    layout = reader.varint()
+    if layout == _TOGETHER:
+        index = _read_choice(reader, grid.size, weights.size)
+    elif layout == _EACH:
+        levels, first = [np.zeros(0, dtype=np.int64)], 0
+        for size in grid.sizes:
+            levels.append(_read_choice(reader, size, reader.varint()) + first)
+            first += size
+        index = np.concatenate(levels)
+    else:
+        raise FileFormatError(f"a choice of centres has layout {layout}, expected {_TOGETHER} or {_EACH}")
+    if index.size != weights.size:
+        raise FileFormatError(f"a leaf has {index.size} scale-field centres and {weights.size} weights")
+    return ScaleField(grid, frozen(index, np.int64), weights)
+
+
+def _read_choice(reader: Reader, total: int, chosen: int) -> IntArray:
     if chosen > total:
         raise FileFormatError(f"a leaf has {chosen} scale-field centres out of {total}")
     rank = int.from_bytes(reader.raw(subset_bytes(total, chosen)), "big")
-    index = subset_of_rank(rank, total, chosen)
-    if rank_of_subset(index, total) != rank:
+    if rank >= math.comb(total, chosen):
         raise FileFormatError(f"a leaf's choice of {chosen} centres out of {total} has a rank out of range")
-    return ScaleField(grid, frozen(index, np.int64), weights)
+    return subset_of_rank(rank, total, chosen)
 
 
 def _read_part(reader: Reader, part: _Retained, vertices: FloatArray) -> RetainedPart:
