@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
@@ -24,6 +25,11 @@ from devices.ndi.replies import (
 __all__ = ["decode_bx", "decode_bx2"]
 
 
+# plain numbers: the operators of enum.Flag cost more than decoding a tool
+_POSES, _TOOL_INFORMATION = int(Option.POSES), int(Option.TOOL_INFORMATION)
+_SINGLE_STRAY, _TOOL_MARKERS, _STRAYS = int(Option.SINGLE_STRAY), int(Option.TOOL_MARKERS), int(Option.STRAYS)
+
+
 class _Bytes:
     """A cursor over a binary body; every step checks that the bytes are there."""
 
@@ -39,7 +45,11 @@ class _Bytes:
         return values
 
     def integer(self, layout: str) -> int:
-        return int(self.take(layout)[0])
+        return self.take(layout)[0]  # type: ignore[return-value]
+
+    def integers(self, layout: str) -> tuple[int, int]:
+        first, second = self.take(layout)
+        return first, second  # type: ignore[return-value]
 
     def points(self, count: int) -> tuple[Point, ...]:
         values = self.take(f"{3 * count}f")
@@ -69,33 +79,34 @@ def decode_bx(body: bytes, options: Option = Option.POSES) -> PoseReport:
         The options that were sent.
     """
     cursor = _Bytes(body, "BX")
-    handles = tuple(_bx_handle(cursor, options) for _ in range(cursor.integer("B")))
-    strays = cursor.markers() if options & Option.STRAYS else None
+    bits = int(options)
+    handles = tuple(_bx_handle(cursor, bits) for _ in range(cursor.integer("B")))
+    strays = cursor.markers() if bits & _STRAYS else None
     status = cursor.integer("H")
     cursor.end()
     return PoseReport(handles, status, strays)
 
 
-def _bx_handle(cursor: _Bytes, options: Option) -> HandleReport:
-    handle, code = cursor.integer("B"), cursor.integer("B")
-    if code not in _BX_STATE:
+def _bx_handle(cursor: _Bytes, options: int) -> HandleReport:
+    handle, code = cursor.integers("BB")
+    state = _BX_STATE.get(code)
+    if state is None:
         raise ProtocolError(f"BX reply: handle {handle:02X} has status {code:02X}, expected 01, 02 or 04")
-    report = HandleReport(handle, _BX_STATE[code])
-    if report.state is HandleState.DISABLED:
-        return report
-    if options & Option.POSES:
-        if report.state is HandleState.TRACKED:
-            w, x, y, z, *position, error = cursor.take("8f")
-            place = (position[0], position[1], position[2])
-            report = replace(report, quaternion=(w, x, y, z), position_mm=place, error_mm=error)
-        report = replace(report, port_status=cursor.integer("I"), frame=cursor.integer("I"))
-    if options & Option.TOOL_INFORMATION:
+    if state is HandleState.DISABLED:
+        return HandleReport(handle, state)
+    quaternion, position, error, port_status, frame, markers = None, None, math.nan, 0, None, None
+    if options & _POSES:
+        if state is HandleState.TRACKED:
+            w, x, y, z, px, py, pz, error = cursor.take("8f")
+            quaternion, position = (w, x, y, z), (px, py, pz)
+        port_status, frame = cursor.integers("II")
+    if options & _TOOL_INFORMATION:
         cursor.take("11B")
-    if options & Option.SINGLE_STRAY and cursor.integer("B"):
+    if options & _SINGLE_STRAY and cursor.integer("B"):
         cursor.points(1)
-    if options & Option.TOOL_MARKERS:
-        report = replace(report, markers_mm=cursor.markers())
-    return report
+    if options & _TOOL_MARKERS:
+        markers = cursor.markers()
+    return HandleReport(handle, state, quaternion, position, error, port_status, frame, markers)
 
 
 _FRAME, _POSE_6D, _POINT_3D, _BUTTON_1D, _ALERT = 0x01, 0x02, 0x03, 0x04, 0x12
@@ -181,20 +192,20 @@ def _bx2_frame(cursor: _Bytes) -> PoseReport:
 
 
 def _bx2_pose(cursor: _Bytes, frame: int) -> HandleReport:
-    handle, status = cursor.integer("H"), cursor.integer("H")
+    handle, status = cursor.integers("HH")
     code = status & 0xFF
     port_status = 1 | INITIALISED | ENABLED
     if code == BX2_OUT:
         port_status |= OUT_OF_VOLUME
     if code == BX2_PARTLY_OUT:
         port_status |= PARTIALLY_OUT_OF_VOLUME
-    report = HandleReport(handle, HandleState.TRACKED, port_status=port_status, frame=frame, code=code)
     if status & _BX2_MISSING:
         states = {_BX2_NOT_ENABLED: HandleState.DISABLED, _BX2_UNPLUGGED: HandleState.UNOCCUPIED}
-        return replace(report, state=states.get(code, HandleState.MISSING))
-    w, x, y, z, *position, error = cursor.take("8f")
-    place = (position[0], position[1], position[2])
-    return replace(report, quaternion=(w, x, y, z), position_mm=place, error_mm=error)
+        state = states.get(code, HandleState.MISSING)
+        return HandleReport(handle, state, port_status=port_status, frame=frame, code=code)
+    w, x, y, z, px, py, pz, error = cursor.take("8f")
+    tracked = HandleState.TRACKED
+    return HandleReport(handle, tracked, (w, x, y, z), (px, py, pz), error, port_status, frame, None, code)
 
 
 def _bx2_points(cursor: _Bytes) -> tuple[int, tuple[Point, ...]]:

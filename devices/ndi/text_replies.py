@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 import re
-from dataclasses import replace
 
 from devices.errors import ProtocolError
 from devices.ndi.replies import HandleReport, HandleState, Option, Point, PoseReport
@@ -33,6 +33,9 @@ class _Text:
             self.at += len(word)
             return True
         return False
+
+    def at_line_end(self) -> bool:
+        return self.text.startswith("\n", self.at)
 
     def hexadecimal(self, count: int) -> int:
         piece = self.take(count)
@@ -72,7 +75,7 @@ def decode_tx(text: str, options: Option = Option.POSES) -> PoseReport:
         Where the text is not laid out so to its last character.
     """
     cursor = _Text(text)
-    handles = tuple(_tx_handle(cursor, options) for _ in range(cursor.hexadecimal(2)))
+    handles = tuple(_tx_handle(cursor, int(options)) for _ in range(cursor.hexadecimal(2)))
     strays = cursor.markers() if options & Option.STRAYS else None
     status = cursor.hexadecimal(4)
     if cursor.at != len(text):
@@ -80,36 +83,36 @@ def decode_tx(text: str, options: Option = Option.POSES) -> PoseReport:
     return PoseReport(handles, status, strays)
 
 
-def _tx_handle(cursor: _Text, options: Option) -> HandleReport:
-    report = HandleReport(cursor.hexadecimal(2), HandleState.TRACKED)
+def _tx_handle(cursor: _Text, options: int) -> HandleReport:
+    handle, state = cursor.hexadecimal(2), HandleState.TRACKED
+    quaternion, position, error, port_status, frame, markers = None, None, math.nan, 0, None, None
     if cursor.word("UNOCCUPIED"):
         # some devices end the line here, others give status and frame as for MISSING: clients disagree
-        port_status, frame = 0, None
         if not cursor.word("\n"):
             port_status, frame = cursor.hexadecimal(8), cursor.hexadecimal(8)
             if not cursor.word("\n"):
                 raise ProtocolError("TX reply: no line end behind UNOCCUPIED")
-        return replace(report, state=HandleState.UNOCCUPIED, port_status=port_status, frame=frame)
-    if options & Option.POSES:
+        return HandleReport(handle, HandleState.UNOCCUPIED, port_status=port_status, frame=frame)
+    if options & Option.POSES.value:
         if cursor.word("MISSING"):
-            report = replace(report, state=HandleState.MISSING)
+            state = HandleState.MISSING
         elif cursor.word("DISABLED"):
-            report = replace(report, state=HandleState.DISABLED)
+            state = HandleState.DISABLED
         else:
-            w, x, y, z = (cursor.number(6, 1e4) for _ in range(4))
+            quaternion = (cursor.number(6, 1e4), cursor.number(6, 1e4), cursor.number(6, 1e4), cursor.number(6, 1e4))
             position = cursor.point()
-            report = replace(report, quaternion=(w, x, y, z), position_mm=position, error_mm=cursor.number(6, 1e4))
-        report = replace(report, port_status=cursor.hexadecimal(8), frame=cursor.hexadecimal(8))
-    if options & Option.TOOL_INFORMATION and not cursor.text.startswith("\n", cursor.at):
+            error = cursor.number(6, 1e4)
+        port_status, frame = cursor.hexadecimal(8), cursor.hexadecimal(8)
+    if options & Option.TOOL_INFORMATION.value and not cursor.at_line_end():
         cursor.take(20)
-    stray = options & Option.SINGLE_STRAY and not cursor.text.startswith("\n", cursor.at)
+    stray = options & Option.SINGLE_STRAY.value and not cursor.at_line_end()
     if stray and not (cursor.word("MISSING") or cursor.word("DISABLED")):
         cursor.point()
-    if options & Option.TOOL_MARKERS and not cursor.text.startswith("\n", cursor.at):
-        report = replace(report, markers_mm=cursor.markers())
+    if options & Option.TOOL_MARKERS.value and not cursor.at_line_end():
+        markers = cursor.markers()
     if not cursor.word("\n"):
-        raise ProtocolError(f"TX reply: expected a line end behind handle {report.handle:02X}")
-    return report
+        raise ProtocolError(f"TX reply: expected a line end behind handle {handle:02X}")
+    return HandleReport(handle, state, quaternion, position, error, port_status, frame, markers)
 
 
 def decode_handles(text: str) -> list[tuple[int, int]]:
