@@ -21,11 +21,15 @@ from guidance.states import Forecast
 if TYPE_CHECKING:
     from hhsr import Shape
 
-_TOUCH_MM = 0.02  # a gap this small is contact: twice the tolerance of the shape's clearance
+_TOLERANCE_MM = 0.05  # of the clearances asked here: 10 ms at 5 mm/s
+_TOUCH_MM = 0.06  # a gap this small is contact
+_SPARE_S = 0.5
 _STEPS = 60
 
 
-def forecast_contact(shape: Shape, needle: Needle, motion: Motion, limits: Limits, age_s: float) -> Forecast:
+def forecast_contact(
+    shape: Shape, needle: Needle, motion: Motion, limits: Limits, age_s: float, gap_mm: float = -inf
+) -> Forecast:
     """When the needle will first touch a shape if it goes on as it moves now.
 
     Parameters
@@ -38,19 +42,26 @@ def forecast_contact(shape: Shape, needle: Needle, motion: Motion, limits: Limit
     limits : Limits
     age_s : float
         How old the motion is at the time from which the forecast counts.
+    gap_mm : float
+        A lower bound of the present clearance, where one is known: what is far is settled without asking the shape.
 
     Returns
     -------
     Forecast
-        All inf where nothing is met within the horizon. The interval leaves out what a hand may decide to do.
+        All inf where no contact is likely soon (`approach_s` and its hysteresis). The interval leaves out what a hand
+        may decide to do.
     """
     horizon = limits.horizon_s
     sideways = needle.length_mm * float(np.linalg.norm(motion.direction.rate))
     speed = motion.speed_mm_s + sideways
     grid = np.linspace(0.0, horizon, 17)
     growth = _growth(motion, limits, grid, 0.0)
-    start = float(shape.clearance(*_one(motion, 0.0, needle), needle.radius_mm))
-    if start > speed * horizon + growth.max() + _TOUCH_MM:
+    soon = limits.approach_s * (1.0 + limits.hysteresis_share) + _SPARE_S
+    reach = speed * soon + float(np.interp(soon, grid, growth)) + _TOUCH_MM
+    if gap_mm > reach:
+        return Forecast()
+    start = _clearance(shape, needle, motion, 0.0)
+    if start > reach:
         return Forecast()
     nominal = _walk(shape, needle, motion, horizon, speed, np.zeros(len(grid)), grid, start)
     at = min(nominal, horizon)
@@ -64,6 +75,10 @@ def forecast_contact(shape: Shape, needle: Needle, motion: Motion, limits: Limit
         latest_s=max(latest - age_s + limits.timing_s, 0.0),
         travel_mm=max(nominal, 0.0) * motion.speed_mm_s,
     )
+
+
+def _clearance(shape: Shape, needle: Needle, motion: Motion, ahead_s: float) -> float:
+    return float(shape.clearance(*_one(motion, ahead_s, needle), needle.radius_mm, tolerance_mm=_TOLERANCE_MM))
 
 
 def _one(motion: Motion, ahead_s: float, needle: Needle) -> tuple[Array, Array]:
@@ -91,6 +106,6 @@ def _walk(
         time += gap / rate
         if time > horizon:
             return inf
-        distance = float(shape.clearance(*_one(motion, time, needle), needle.radius_mm))
+        distance = _clearance(shape, needle, motion, time)
     # grazing: the walk has not finished. No contact lies before this time, and nothing proves one after it.
     return time if growth[-1] >= 0.0 else inf

@@ -25,6 +25,8 @@ from guidance.states import SEVERITY, Event, Forecast, Report, State, StructureR
 from guidance.trajectory import Trajectory
 
 _AXIS_AHEAD_MM = 200.0
+_FAR_SHARE, _DEEP_SHARE = 0.05, 0.2
+_REFRESH_S = 0.1
 
 
 @dataclass
@@ -36,6 +38,12 @@ class _Watch:
     state: State = State.UNKNOWN
     better_since: float = inf
     last: StructureReport | None = None
+    measured: tuple[Array, Array, float] | None = None  # hub, tip, clearance when the shape was last asked
+    forecast: tuple[float, Forecast] | None = None  # and the time of the motion it was made for
+
+    def forget(self) -> None:
+        """Drop what was measured of a needle that is somewhere else now."""
+        self.measured = self.forecast = None
 
 
 class Monitor:
@@ -101,6 +109,8 @@ class Monitor:
             return self._report([self._unknown(w, gated.reason) for w in self._watches])
         if gated.restart or (self._pose is not None and frame.time_s - self._pose[0] > self.limits.stale_s):
             self._filter.reset()
+            for w in self._watches:
+                w.forget()
         T = gated.T_patient_tip
         self._distrust, self._pose = "", (frame.time_s, T)
         self._motion = self._filter.update(frame.time_s, T[:3, 3].copy(), T[:3, 2].copy())
@@ -131,23 +141,52 @@ class Monitor:
 
     def _look(self, watch: _Watch, T: Array) -> StructureReport:
         """One structure as the newest pose stands to it."""
-        s, shape, needle, limits = watch.structure, watch.structure.shape, self.scene.needle, self.limits
+        s, shape, needle = watch.structure, watch.structure.shape, self.scene.needle
         if shape is None:
             return self._unknown(watch, "no model of this structure")
         assert self._motion is not None
         hub, tip = needle.axis(T)
-        distance = float(shape.clearance(hub, tip, needle.radius_mm))
+        distance = self._distance(watch, hub, tip)
         inside = distance <= 0.0 and bool(shape.contains(tip))
         ahead = float(shape.first_crossing(tip, tip + _AXIS_AHEAD_MM * T[:3, 2])) * _AXIS_AHEAD_MM
-        forecast = Forecast(0.0, 0.0, 0.0, 0.0)
-        if distance > 0.0:
-            forecast = forecast_contact(shape, needle, self._motion, limits, self._age_s)
+        forecast = Forecast(0.0, 0.0, 0.0, 0.0) if distance <= 0.0 else self._forecast(watch, distance)
         needed, fit_error = self._needed(s, hub, tip, distance)
         state, reason = self._judge(distance, inside, needed, forecast, relaxed=False)
         line = StructureReport(
             s.name, s.role, state, reason, watch.hash, distance, _or_inf(ahead), needed, fit_error, forecast
         )
         return self._settle(watch, line, inside)
+
+    def _distance(self, watch: _Watch, hub: Array, tip: Array) -> float:
+        """A lower bound of the capsule clearance, mm, at most a few per cent below it.
+
+        A clearance changes no faster than the needle's ends move: the shape is asked again only once they have moved by
+        a twentieth of the gap (a fifth of the depth inside). The sign is always that of the clearance.
+        """
+        if watch.measured is not None:
+            hub0, tip0, distance = watch.measured
+            moved = max(float(np.linalg.norm(hub - hub0)), float(np.linalg.norm(tip - tip0)))
+            if moved <= (_FAR_SHARE if distance > 0.0 else _DEEP_SHARE) * abs(distance):
+                return distance - moved
+        assert watch.structure.shape is not None
+        distance = float(watch.structure.shape.clearance(hub, tip, self.scene.needle.radius_mm))
+        watch.measured = hub, tip, distance
+        return distance
+
+    def _forecast(self, watch: _Watch, distance: float) -> Forecast:
+        """First contact ahead, made anew every 0.1 s (where no alarm hangs on it every 0.3 s), aged in between."""
+        m = self._motion
+        assert m is not None
+        assert watch.structure.shape is not None
+        if not self._is_moving():
+            return Forecast()
+        if watch.forecast is not None:
+            made, forecast = watch.forecast
+            if m.time_s - made < (_REFRESH_S if watch.structure.role == AVOID else 3.0 * _REFRESH_S):
+                return forecast.later(m.time_s - made)
+        forecast = forecast_contact(watch.structure.shape, self.scene.needle, m, self.limits, self._age_s, distance)
+        watch.forecast = m.time_s, forecast
+        return forecast
 
     def _needed(self, s: Structure, hub: Array, tip: Array, distance: float) -> tuple[float, float]:
         """Margin plus budget, mm, and the fit error in it: the nearest leaf's where that matters, else the largest."""
@@ -172,7 +211,7 @@ class Monitor:
             return State.INSIDE, "the tip is inside"
         if distance <= touch:
             return State.CONTACT, f"the needle touches it ({distance:.2f} mm)"
-        if forecast.seconds <= soon and self._is_moving():
+        if forecast.seconds <= soon:
             span = f"{forecast.earliest_s:.1f} to {_text(forecast.latest_s)}"
             return State.APPROACHING, (
                 f"contact in {forecast.seconds:.1f} s ({span}), {forecast.travel_mm:.1f} mm ahead at the present motion"

@@ -84,7 +84,7 @@ class Rod:
         q = foot + self.radius * away
         return q, np.linalg.norm(p - q, axis=-1)
 
-    def clearance(self, starts, ends, radius=0.0):
+    def clearance(self, starts, ends, radius=0.0, tolerance_mm=0.01):
         starts, ends = np.asarray(starts, float), np.asarray(ends, float)
         gap = segment_distance(starts.reshape(-1, 3), ends.reshape(-1, 3), self.start, self.end)
         return (gap - self.radius - radius).reshape(starts.shape[:-1])
