@@ -14,7 +14,7 @@ from hhsr.kernels.mesh_edges import number_edges
 from hhsr.model import FloatArray, IntArray, ModelLeaf, rotation_matrix
 
 START_LEVEL = 4  # 2,562 directions, 0.07 rad apart: the finest scale-field centres are about as dense
-MAX_ROUNDS = 12
+MAX_ROUNDS = 16
 FLATTEST = 0.1  # the share of a radial gap that is taken as distance, at least
 
 
@@ -32,12 +32,14 @@ def _start() -> tuple[FloatArray, IntArray]:
     return directions / np.linalg.norm(directions, axis=1, keepdims=True), np.array(sphere.faces, dtype=np.int64)
 
 
-def tessellate(leaf: ModelLeaf, region: list[Halfspace], tolerance_mm: float) -> tuple[FloatArray, IntArray]:
+def tessellate(
+    leaf: ModelLeaf, region: list[Halfspace], tolerance_mm: float, finest_mm: float, affordable: int
+) -> tuple[FloatArray, IntArray]:
     """Return (vertices (n, 3) in the tree's frame, faces (m, 3)), closed and outward, vertices on the leaf's surface.
 
     Edges and face centres within the region lie within `tolerance_mm` of the surface; outside it the mesh stays coarse.
-    Every new vertex lies on the great circle of the edge it splits, so that the mesh is a radial graph and never meets
-    itself.
+    As long as that takes fewer than `affordable` faces it goes on, to `finest_mm` at most. Every new vertex lies on the
+    great circle of the edge it splits, so that the mesh is a radial graph and never meets itself.
     """
     arrays = leaf_arrays(leaf)
     rotation = rotation_matrix(leaf.rotation)
@@ -46,10 +48,15 @@ def tessellate(leaf: ModelLeaf, region: list[Halfspace], tolerance_mm: float) ->
     directions, faces = _start()
     points = _on_surface(directions, arrays)
     active = np.ones(len(faces), dtype=bool)
+    goal = tolerance_mm
     for _ in range(MAX_ROUNDS):
-        of_face, split, middles = _edges_to_split(points, faces, active, arrays, normals, offsets, tolerance_mm)
+        of_face, split, middles = _edges_to_split(points, faces, active, arrays, normals, offsets, goal)
         if len(split) == 0:
-            break
+            finer = max(finest_mm, goal * len(faces) / affordable)  # faces grow as 1 / tolerance
+            if goal < tolerance_mm or finer > 0.7 * goal:
+                break
+            goal, active = finer, np.ones(len(faces), dtype=bool)
+            continue
         number = np.full(of_face.max() + 1, -1)
         number[split] = len(points) + np.arange(len(split))
         points = np.concatenate([points, middles])
