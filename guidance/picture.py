@@ -14,7 +14,7 @@ from guidance.needle import Array
 from guidance.planning.plans import Plans
 from guidance.scene import AVOID, Scene, Structure
 from guidance.simulation import Outcome
-from guidance.states import State
+from guidance.states import SEVERITY, State
 from guidance.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -36,12 +36,13 @@ _PIXEL_MM = 0.5
 
 @dataclass(frozen=True, eq=False)
 class _Plane:
-    """A slice: origin (3,), in-plane unit axes right and down (3,), half size in mm."""
+    """A slice: origin (3,) and its depth along the path, in-plane unit axes right and down (3,), half size; mm."""
 
     origin: Array
     right: Array
     down: Array
     half_mm: float
+    depth_mm: float
 
     def flat(self, points: Array) -> Array:
         """In-plane coordinates (..., 2), mm."""
@@ -142,8 +143,9 @@ def _planes(scene: Scene, path: Trajectory, other: Array | None) -> tuple[_Plane
         side = side - (side @ down) * down
     right = side / np.linalg.norm(side)
     half = float(np.clip(0.5 * path.depth_mm + 35.0, 50.0, 110.0))
-    origin = path.point(0.5 * path.depth_mm)
-    return _Plane(origin, right, down, half), _Plane(origin, np.cross(down, right), down, half)
+    depth = 0.5 * path.depth_mm
+    origin = path.point(depth)
+    return _Plane(origin, right, down, half, depth), _Plane(origin, np.cross(down, right), down, half, depth)
 
 
 def _draw_slice(axes: Axes, scene: Scene, plane: _Plane, colours: dict[str, str]) -> None:
@@ -163,7 +165,8 @@ def _draw_slice(axes: Axes, scene: Scene, plane: _Plane, colours: dict[str, str]
     axes.set_xlim(-plane.half_mm, plane.half_mm)
     axes.set_ylim(plane.half_mm, -plane.half_mm)
     axes.set_xlabel("mm across the path")
-    axes.set_ylabel("mm along the path (needle comes from above)")
+    axes.set_ylabel("depth, mm (the needle comes from above)")
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value + plane.depth_mm:.0f}")
     for position, vector, where in (
         ((0.985, 0.5), plane.right, "right"),
         ((0.015, 0.5), -plane.right, "left"),
@@ -202,7 +205,7 @@ def _draw_events(axes: Axes, plane: _Plane, outcome: Outcome) -> None:
     """Where the tip was when a structure to avoid was approached or met."""
     drawn: set[State] = set()
     for e in outcome.alarms:
-        if e.after not in _EVENT_MARKS:
+        if e.after not in _EVENT_MARKS or SEVERITY[e.after] < SEVERITY.get(e.before, 0):
             continue
         marker, colour = _EVENT_MARKS[e.after]
         at = plane.flat(outcome.path.point(float(np.interp(e.time_s, outcome.times, outcome.depths))))
@@ -232,7 +235,7 @@ def _draw_gaps(axes: Axes, scene: Scene, plans: Plans, path: Trajectory, colours
     axes.set_xlabel("depth of the point along the path, mm (0: entry)")
     axes.set_ylabel("gap to the needle, mm")
     axes.set_title("How near the path passes (dashed: margin + error budget)")
-    axes.legend(fontsize=8, loc="upper right", ncols=2)
+    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4)
     axes.grid(alpha=0.25)
 
 
@@ -266,7 +269,7 @@ def _draw_warnings(axes: Axes, scene: Scene, outcome: Outcome | None, colours: d
     axes.set_ylabel("reported distance, mm")
     about = f"; background: state to {worst.structure}" if worst is not None else ""
     axes.set_title(f"Warnings while driven wrong{about}" if "wrong" in outcome.name else f"Warnings{about}")
-    axes.legend(fontsize=8, loc="upper right", ncols=2)
+    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4)
     axes.grid(alpha=0.25)
 
 
@@ -278,7 +281,6 @@ def _shade(axes: Axes, times: Array, states: Sequence[State]) -> None:
             axes.axvspan(times[start], end, color=_STATE_COLOURS[states[start]], zorder=0)
             if end - times[start] > 0.8:
                 middle = 0.5 * (times[start] + end)
-                axes.text(
-                    middle, 0.02, states[start].value, transform=axes.get_xaxis_transform(), ha="center", fontsize=8
-                )
+                place = axes.get_xaxis_transform()
+                axes.text(middle, 0.985, states[start].value, transform=place, ha="center", va="top", fontsize=8)
             start = k
