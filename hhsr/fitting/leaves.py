@@ -28,7 +28,8 @@ from hhsr.model import CentreGrid, FloatArray, ModelLeaf, ScaleField, frozen
 T = TypeVar("T")
 
 LEAF_NUMBERS = 9
-ATOMS_PER_NUMBER = 14
+ATOMS_PER_NUMBER = 7
+SCOUTS_ATOMS = 4
 FINEST = (60, 8_000)
 ROUNDS = 3
 STEPS = 3
@@ -53,7 +54,7 @@ def fit_leaves(solid: Solid, pieces: list[Piece], budget: int, thorough: bool) -
     free = budget - LEAF_NUMBERS * len(pieces)
     if free < 0:
         raise ValueError(f"budget: got {budget} numbers for {len(pieces)} leaves, expected {LEAF_NUMBERS} for each")
-    grid = grid_for(int(np.clip(ATOMS_PER_NUMBER * budget / len(pieces), *FINEST)))
+    grid = grid_for(int(np.clip((ATOMS_PER_NUMBER if thorough else SCOUTS_ATOMS) * budget / len(pieces), *FINEST)))
     tasks = in_threads(
         lambda k: task_of(solid, pieces[k].region, pieces[k].members, pieces[k].centre, SEED), len(pieces)
     )

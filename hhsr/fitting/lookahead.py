@@ -23,12 +23,15 @@ _NOTHING = RetainedPart(frozen(np.zeros((0, 3))), frozen(np.zeros((0, 3)), np.in
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A part of the solid: its region, (m,) samples, centre, misfit (mm · samples) and how many cuts lead to it."""
+    """A part of the solid: its region, (m,) samples, centre, misfit (mm · samples), how many samples the
+    centre does not see, and how many cuts lead to it.
+    """
 
     region: Region
     members: IntArray
     centre: FloatArray
     misfit: float
+    hidden: float
     depth: int
 
 
@@ -61,8 +64,7 @@ class Parting:
         self._solid = solid
         self._power = power
         members = np.arange(solid.samples.points.shape[0])
-        centre, misfit = best_centre(solid, members, everywhere(), power)
-        self._pieces = [[Piece(everywhere(), members, centre, misfit, 0)]]
+        self._pieces = [[Piece(everywhere(), members, *best_centre(solid, members, everywhere(), power), 0)]]
         self._steps: list[Step] = []
         self._offers: list[Split | Literal["unknown"] | None] = ["unknown"]
 
@@ -80,6 +82,10 @@ class Parting:
     def misfit(self, count: int) -> float:
         """Return the summed misfit of `count` pieces, mm · samples."""
         return sum(piece.misfit for piece in self._pieces[count - 1])
+
+    def hidden(self, count: int) -> float:
+        """Return the share of the samples that the centres of `count` pieces do not see."""
+        return sum(piece.hidden for piece in self._pieces[count - 1]) / self._solid.samples.points.shape[0]
 
     def tree(self, leaves: Sequence[Node]) -> Node:
         """Return the tree of as many pieces as there are leaves, given in the order of `pieces`."""
@@ -112,8 +118,10 @@ def _fall(piece: Piece, offer: Split | Literal["unknown"] | None) -> float:
     return piece.misfit - offer.misfit if isinstance(offer, Split) else -np.inf
 
 
-def best_centre(solid: Solid, members: IntArray, region: Region, power: float) -> tuple[FloatArray, float]:
-    """Return the point inside the solid and the region from which the members look most like a radius, and the misfit.
+def best_centre(solid: Solid, members: IntArray, region: Region, power: float) -> tuple[FloatArray, float, float]:
+    """Return the point inside the solid and the region from which the members look most like a radius.
+
+    With it the misfit, and how many members it does not see.
 
     The misfit is the sum over all members, in mm (for power 1), from the few that are looked at.
     """
@@ -124,20 +132,16 @@ def best_centre(solid: Solid, members: IntArray, region: Region, power: float) -
         inner = np.array([int(((solid.inner - middle) ** 2).sum(axis=1).argmin())])
     tried = inner[_spread(solid.inner[inner], solid.depth[inner], CENTRES)]
     for _ in range(2):
-        values = _misfits(solid, few, solid.inner[tried], power)
-        best = tried[int(values.argmin())]
-        least = float(values.min())
+        gaps = hidden(solid, solid.inner[tried], few)
+        values = misfits(solid.samples.points, solid.samples.normals, few, gaps, solid.inner[tried], power)
+        at = int(values.argmin())
+        best, least, unseen = tried[at], float(values[at]), int((gaps[at] > 0.0).sum())
         near = np.argsort(((solid.inner[inner] - solid.inner[best]) ** 2).sum(axis=1), kind="stable")
         tried = inner[near[: inner.size // CENTRES + 1 : max(inner.size // CENTRES**2, 1)]][:CENTRES]
         if best not in tried:
             tried = np.append(tried, best)
-    return solid.inner[best], least * members.size / few.size
-
-
-def _misfits(solid: Solid, few: IntArray, centres: FloatArray, power: float) -> FloatArray:
-    """Return the misfit of some members from each of (c, 3) centres."""
-    gaps = hidden(solid, centres, few)
-    return misfits(solid.samples.points, solid.samples.normals, few, gaps, centres, power)
+    share = members.size / few.size
+    return solid.inner[best], least * share, unseen * share
 
 
 def hidden(solid: Solid, centres: FloatArray, members: IntArray) -> FloatArray:

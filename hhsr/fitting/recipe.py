@@ -23,6 +23,7 @@ NUMBERS_A_PIECE = 60
 MOST_PIECES = 32
 PATIENCE = 3
 WORST_SHARE = 0.01
+HIDDEN = 0.03
 
 
 class Choice(NamedTuple):
@@ -86,7 +87,7 @@ def _scouts(solid: Solid, parting: Parting, budget: int) -> list[Choice]:
     for count in range(1, most + 1):
         if not parting.grown(count):
             break
-        if found and count < most and _hopeless(parting, count):
+        if count < most and _hopeless(parting, count):
             continue
         found.append(Choice(count, _fit(solid, parting, count, budget, thorough=False)))
         best = min(found, key=lambda choice: choice.score)
@@ -99,8 +100,12 @@ def _scouts(solid: Solid, parting: Parting, budget: int) -> list[Choice]:
 
 
 def _hopeless(parting: Parting, count: int) -> bool:
-    """Return whether the next cut promises so much that it is not worth fitting without it."""
-    return parting.grown(count + 1) and parting.misfit(count + 1) < 0.6 * parting.misfit(count)
+    """Return whether too much stays hidden that the next cut would show."""
+    return (
+        parting.hidden(count) > HIDDEN
+        and parting.grown(count + 1)
+        and parting.hidden(count + 1) < parting.hidden(count)
+    )
 
 
 def _fit(solid: Solid, parting: Parting, pieces: int, budget: int, thorough: bool) -> Fitted:

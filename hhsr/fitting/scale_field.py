@@ -11,8 +11,8 @@ from hhsr.fitting.rows import Rows
 from hhsr.kernels.selection import back_substituted, dictionary_rows, orthogonal_selection, solve_normal
 from hhsr.model import CentreGrid, FloatArray, IntArray, ModelLeaf, ScaleField, Superquadric
 
-RATIO = 1.6
-SUPPORT = 2.5
+RATIO = 1.5
+SUPPORT = 3.3
 COARSEST = 20
 RIDGE = 1e-5
 NO_AXES = np.zeros(0)
@@ -39,7 +39,7 @@ class Selection(NamedTuple):
 
 
 def grid_for(finest: int) -> CentreGrid:
-    """Return the dictionary whose finest grid has about `finest` centres; each coarser one is 1.6 times wider."""
+    """Return the dictionary whose finest grid has about `finest` centres; each coarser one is 1.5 times wider."""
     sizes = [max(finest, COARSEST)]
     while sizes[-1] / RATIO**2 >= COARSEST:
         sizes.append(round(sizes[-1] / RATIO**2))
