@@ -62,11 +62,13 @@ def run(
 @contextmanager
 def _bad_input_ends() -> Iterator[None]:
     """Turn what the user can mend into one line on the error stream and exit code 2."""
+    from devices.errors import DeviceError
     from guidance.errors import GuidanceError
+    from hhsr.errors import HhsrError
 
     try:
         yield
-    except (GuidanceError, OSError) as error:
+    except (GuidanceError, HhsrError, DeviceError, OSError) as error:
         Console(stderr=True, highlight=False).print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
         raise typer.Exit(_BAD_INPUT) from None
 

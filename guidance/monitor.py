@@ -25,6 +25,8 @@ from guidance.states import SEVERITY, Event, Forecast, Report, State, StructureR
 from guidance.trajectory import Trajectory
 
 _AXIS_AHEAD_MM = 200.0
+_TOOL_IS_TIP = np.eye(4)
+_TOOL_IS_TIP.flags.writeable = False
 _FAR_SHARE, _DEEP_SHARE = 0.05, 0.2
 _REFRESH_S = 0.1
 
@@ -59,7 +61,8 @@ class Monitor:
     T_patient_tracker : (4, 4) array, optional
         Registration, mm. None is unregistered: everything is UNKNOWN.
     T_tool_tip : (4, 4) array, optional
-        Calibration: the tip's frame in the tool's, +z along the needle towards the tip. None is uncalibrated: UNKNOWN.
+        Calibration: the tip's frame in the tool's, +z along the needle towards the tip. By default the tracker's tool is
+        the tip itself. None is uncalibrated: everything is UNKNOWN.
     limits : Limits, optional
 
     Raises
@@ -74,7 +77,7 @@ class Monitor:
         plan: Plan | Trajectory | None = None,
         tool: str = "needle",
         T_patient_tracker: ArrayLike | None = None,
-        T_tool_tip: ArrayLike | None = None,
+        T_tool_tip: ArrayLike | None = _TOOL_IS_TIP,
         limits: Limits | None = None,
     ) -> None:
         self.scene = scene
@@ -189,9 +192,14 @@ class Monitor:
         return forecast
 
     def _needed(self, s: Structure, hub: Array, tip: Array, distance: float) -> tuple[float, float]:
-        """Margin plus budget, mm, and the fit error in it: the nearest leaf's where that matters, else the largest."""
+        """Margin plus budget, mm, and the fit error in it: the nearest leaf's where that matters, else the largest.
+
+        What is not to be avoided needs no room for the error of its fit: nothing hangs on being warned of it early.
+        """
         assert s.shape is not None
         fixed = s.margin_mm + self.scene.errors.without_fit_mm
+        if s.role != AVOID:
+            return fixed, 0.0
         statistic = self.scene.errors.fit
         fit_error = fit_error_range_mm(s.shape, statistic)[1]
         if 0.0 < distance <= fixed + fit_error + self.limits.hysteresis_mm:
