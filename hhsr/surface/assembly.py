@@ -17,7 +17,7 @@ from hhsr.surface.polish import polish
 from hhsr.surface.sample import Halfspace, tessellate
 from hhsr.surface.separate import has_two_faces_an_edge, separate
 from hhsr.surface.sources import Patch, Retained, Source, Step, Strip
-from hhsr.surface.tidy import tidy
+from hhsr.surface.tidy import apart, tidy
 from hhsr.surface.trim import trim
 
 # Edges and face centres are held to this share of what was asked: a facet then misses by 0.4 of it in the mean. At
@@ -55,7 +55,7 @@ def reconstruct(tree: Tree, tolerance_mm: float = 0.02, band_tables: BandTables 
     assembly = _Assembly(tree, tolerance, band_tables)
     piece = assembly.node(tree.root, [])
     if not isinstance(tree.root, RetainedPart):  # a mesh kept whole stays as it is
-        piece = tidy(piece, max(SHORTEST * tolerance, STORABLE), STORABLE)
+        piece = apart(tidy(piece, max(SHORTEST * tolerance, STORABLE), STORABLE), 0.5 * STORABLE)
     rotation, translation = rotation_matrix(tree.pose[:3]), tree.pose[3:]
     inner = leaf_inside(tree.root, piece)
     mesh = trimesh.Trimesh(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from hhsr.model import FloatArray, IntArray
 from hhsr.surface.piece import Piece
@@ -25,6 +26,25 @@ def tidy(piece: Piece, shortest_mm: float, storable_mm: float) -> Piece:
                 break
             piece = smaller
     return piece
+
+
+def apart(piece: Piece, storable_mm: float) -> Piece:
+    """Return the piece with vertices that coincide without an edge between them moved apart, by a few `storable_mm`.
+
+    Where two sheets touch along an edge, a reader that merges equal vertices would find four faces there.
+    """
+    vertices = piece.vertices.copy()
+    edges = piece.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    for _ in range(PASSES):
+        pairs = cKDTree(vertices).query_pairs(storable_mm, output_type="ndarray")
+        if len(pairs) == 0:
+            break
+        for vertex in np.unique(pairs[:, 1]).tolist():
+            way = vertices[edges[edges[:, 0] == vertex, 1]].mean(axis=0) - vertices[vertex]
+            length = float(np.linalg.norm(way))
+            if length > 0:
+                vertices[vertex] += way / length * min(4.0 * storable_mm, 0.2 * length)
+    return Piece(vertices, piece.faces, piece.source)
 
 
 def _short_edges(piece: Piece, shortest_mm: float) -> IntArray:
