@@ -20,10 +20,11 @@ from hhsr.fitting.refine import (
     start_rows,
     task_of,
 )
-from hhsr.fitting.scale_field import fit_ellipsoid, grid_for, leaf_of, select_centres
+from hhsr.fitting.rows import Rows
+from hhsr.fitting.scale_field import NONE, costs_of_dropping, fit_ellipsoid, grid_for, leaf_of, select_centres
 from hhsr.fitting.solid import Solid
 from hhsr.fitting.spend import counts_within
-from hhsr.model import CentreGrid, FloatArray, ModelLeaf, ScaleField, frozen
+from hhsr.model import IntArray, ModelLeaf, ScaleField, frozen
 
 T = TypeVar("T")
 
@@ -31,7 +32,8 @@ LEAF_NUMBERS = 9
 ATOMS_PER_NUMBER = 7
 SCOUTS_ATOMS = 4
 FINEST = (60, 8_000)
-ROUNDS = 3
+SWAPS = 3
+SWAPPED = 0.3
 STEPS = 3
 POWER = 1.5
 SEED = 5
@@ -49,7 +51,7 @@ class Fitted(NamedTuple):
 def fit_leaves(solid: Solid, pieces: list[Piece], budget: int, thorough: bool) -> Fitted:
     """Return the leaves of the pieces within a budget of numbers.
 
-    thorough: three rounds of selection on what the last round missed, against one.
+    thorough: also up to three rounds in which the centres worth least are swapped for better ones.
     """
     free = budget - LEAF_NUMBERS * len(pieces)
     if free < 0:
@@ -62,43 +64,49 @@ def fit_leaves(solid: Solid, pieces: list[Piece], budget: int, thorough: bool) -
         lambda k: fit_ellipsoid(start_rows(tasks[k], solid, pieces[k].centre).joined(hint_rows(tasks[k], solid))),
         len(pieces),
     )
-    leaves = [bare_leaf(p.centre, a, grid) for p, a in zip(pieces, axes, strict=True)]
+    bare = [leaf_of(p.centre, a, ScaleField(grid, NONE, frozen([]))) for p, a in zip(pieces, axes, strict=True)]
+    rows = [_first_rows(solid, t, leaf) for t, leaf in zip(tasks, bare, strict=True)]
     limits = [int(2.0 * free / len(pieces)) + 1] * len(pieces)
-    for turn in range(ROUNDS if thorough else 1):
-        leaves = _chosen(solid, pieces, tasks, leaves, axes, grid, limits, free, turn == 0)
-        limits = [min(int(1.3 * leaf.scale_field.weights.size) + 8, free) for leaf in leaves]
-        leaves = _refined(solid, tasks, leaves, STEPS if thorough else 1)
-    return _judged(solid, tasks, leaves)
+    leaves = _chosen(bare, rows, [NONE] * len(pieces), limits, free)
+    best = _judged(solid, tasks, _refined(solid, tasks, leaves, STEPS if thorough else 1))
+    for _ in range(SWAPS if thorough else 0):
+        swapped = _judged(solid, tasks, _refined(solid, tasks, _swapped(solid, tasks, best.leaves, free), STEPS))
+        if swapped.mean >= best.mean:
+            break
+        best = swapped
+    return best
 
 
-def bare_leaf(centre: FloatArray, half_axes: FloatArray, grid: CentreGrid) -> ModelLeaf:
-    """Return a leaf without centres."""
-    return leaf_of(centre, half_axes, ScaleField(grid, frozen([], np.int64), frozen([])))
+def _first_rows(solid: Solid, task: Task, leaf: ModelLeaf) -> Rows:
+    """Return the rows of a leaf that is still bare."""
+    half_axes = np.asarray(leaf.superquadric.half_axes)
+    return start_rows(task, solid, leaf.centre).joined(hold_rows(task, solid, half_axes))
+
+
+def _swapped(solid: Solid, tasks: list[Task], leaves: list[ModelLeaf], free: int) -> list[ModelLeaf]:
+    """Return the leaves without the centres that all of them together miss least, and with better ones instead."""
+    rows = in_threads(lambda k: mending_rows(solid, tasks[k], leaves[k]), len(leaves))
+    costs = in_threads(lambda k: costs_of_dropping(rows[k], leaves[k]), len(leaves))
+    limit = float(np.quantile(np.concatenate(costs), SWAPPED)) if sum(c.size for c in costs) else 0.0
+    held = [leaf.scale_field.index[c > limit] for leaf, c in zip(leaves, costs, strict=True)]
+    limits = [min(int(1.5 * leaf.scale_field.index.size) + 8, free) for leaf in leaves]
+    return _chosen(leaves, rows, held, limits, free)
 
 
 def _chosen(
-    solid: Solid,
-    pieces: list[Piece],
-    tasks: list[Task],
-    leaves: list[ModelLeaf],
-    axes: list[FloatArray],
-    grid: CentreGrid,
-    limits: list[int],
-    free: int,
-    first: bool,
+    leaves: list[ModelLeaf], rows: list[Rows], held: list[IntArray], limits: list[int], free: int
 ) -> list[ModelLeaf]:
-    """Return leaves with centres chosen anew, by what the leaves so far miss."""
-
-    def selected(k: int):  # type: ignore[no-untyped-def]
-        if first:
-            rows = start_rows(tasks[k], solid, pieces[k].centre).joined(hold_rows(tasks[k], solid, axes[k]))
-        else:
-            rows = mending_rows(solid, tasks[k], leaves[k])
-        return select_centres(rows, axes[k], grid, limits[k])
-
-    selections = in_threads(selected, len(pieces))
-    counts = counts_within([s.gains for s in selections], grid.size, free)
-    return [leaf_of(p.centre, a, s.field(k)) for p, a, s, k in zip(pieces, axes, selections, counts, strict=True)]
+    """Return the leaves with centres chosen for the rows: those held, and the best others within the free numbers."""
+    grid = leaves[0].scale_field.grid
+    selections = in_threads(
+        lambda k: select_centres(rows[k], np.asarray(leaves[k].superquadric.half_axes), grid, limits[k], held[k]),
+        len(leaves),
+    )
+    counts = counts_within([s.gains for s in selections], grid.size, free, [s.held for s in selections])
+    return [
+        leaf_of(leaf.centre, leaf.superquadric.half_axes, s.field(k))
+        for leaf, s, k in zip(leaves, selections, counts, strict=True)
+    ]
 
 
 def _refined(solid: Solid, tasks: list[Task], leaves: list[ModelLeaf], steps: int) -> list[ModelLeaf]:

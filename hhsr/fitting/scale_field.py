@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from hhsr.fitting.rows import Rows
-from hhsr.kernels.selection import back_substituted, dictionary_rows, orthogonal_selection, solve_normal
+from hhsr.kernels.refinement import chosen_rows
+from hhsr.kernels.selection import back_substituted, dictionary_rows, drop_costs, orthogonal_selection, solve_normal
 from hhsr.model import CentreGrid, FloatArray, IntArray, ModelLeaf, ScaleField, Superquadric
 
 RATIO = 1.5
 SUPPORT = 3.3
 COARSEST = 20
 RIDGE = 1e-5
-NO_AXES = np.zeros(0)
+NO_ROTATION = np.zeros(0)
+NONE = np.zeros(0, np.int64)
 
 
 class Selection(NamedTuple):
-    """Centres of one leaf in the order in which they pay.
+    """Centres of one leaf in the order in which they pay, the first `held` of them kept from before.
 
     index: (k,) atoms of the grid. gains: (k,) fall of the rows' sum of squares, mm². triangle, right: see
     `hhsr.kernels.selection.orthogonal_selection`.
@@ -30,6 +33,7 @@ class Selection(NamedTuple):
     gains: FloatArray
     triangle: FloatArray
     right: FloatArray
+    held: int
 
     def field(self, count: int) -> ScaleField:
         """Return the scale field of the first `count` centres."""
@@ -88,24 +92,40 @@ def fit_ellipsoid(rows: Rows, iterations: int = 12) -> FloatArray:
     return np.exp(np.clip(logs, math.log(0.05 * mean), math.log(20.0 * mean)))
 
 
-def select_centres(
-    rows: Rows, half_axes: FloatArray, grid: CentreGrid, count: int, current: FloatArray | None = None
-) -> Selection:
-    """Return up to `count` centres that bring the leaf nearest to the rows.
+def select_centres(rows: Rows, half_axes: FloatArray, grid: CentreGrid, count: int, held: IntArray = NONE) -> Selection:
+    """Return up to `count` centres that bring the leaf nearest to the rows, the `held` ones among them.
 
-    current: (n,) radii of the leaf so far, which tells the bounds that are broken; None: of the bare ellipsoid.
+    Bounds count where the bare ellipsoid breaks them.
     """
+    pointer, index, value, scale, target = _system(rows, half_axes, lambda u: dictionary(grid, u))
+    chosen, gains, triangle, right = orthogonal_selection(
+        pointer, index, value, scale, target, grid.size, count, RIDGE, held
+    )
+    return Selection(grid, chosen, gains, triangle, right, held.size)
+
+
+def costs_of_dropping(rows: Rows, leaf: ModelLeaf) -> FloatArray:
+    """Return (k,) by how much the rows' sum of squares (mm²) rises when a leaf loses one of its centres."""
+    field = leaf.scale_field
+    centres, extents = np.ascontiguousarray(field.grid.centres[field.index]), field.grid.extents[field.index]
+    system = _system(rows, np.asarray(leaf.superquadric.half_axes), lambda u: chosen_rows(u, centres, extents))
+    k = field.index.size
+    _, _, triangle, right = orthogonal_selection(*system, k, k, RIDGE, np.arange(k))
+    costs: FloatArray = drop_costs(triangle, right)
+    return costs
+
+
+def _system(
+    rows: Rows, half_axes: FloatArray, atoms: Callable[[FloatArray], tuple[IntArray, IntArray, FloatArray]]
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]:
+    """Return the linear system that rows ask of the scale field: compressed λ, scale and target of each row."""
     q = ellipsoid_radii(half_axes, rows.directions)
-    known = q if current is None else current
-    weights = np.where(rows.bound & (known >= rows.radii), 0.0, rows.weights)
+    weights = np.where(rows.bound & (q >= rows.radii), 0.0, rows.weights)
     kept = np.flatnonzero(weights > 0.0)
-    pointer, index, value = dictionary(grid, rows.directions[kept])
-    scale = (weights * q)[kept]
-    target = (weights * (q - rows.radii))[kept]
-    chosen, gains, triangle, right = orthogonal_selection(pointer, index, value, scale, target, grid.size, count, RIDGE)
-    return Selection(grid, chosen, gains, triangle, right)
+    pointer, index, value = atoms(np.ascontiguousarray(rows.directions[kept]))
+    return pointer, index, value, (weights * q)[kept], (weights * (q - rows.radii))[kept]
 
 
 def leaf_of(centre: FloatArray, half_axes: FloatArray, field: ScaleField) -> ModelLeaf:
     """Return the leaf: an ellipsoid on the tree's axes with a scale field."""
-    return ModelLeaf(centre, NO_AXES, Superquadric(half_axes), field)
+    return ModelLeaf(centre, NO_ROTATION, Superquadric(half_axes), field)

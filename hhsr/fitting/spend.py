@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -10,17 +11,20 @@ import numpy as np
 from hhsr.model import FloatArray, subset_numbers
 
 
-def counts_within(gains: list[FloatArray], dictionary_size: int, budget: int) -> list[int]:
+def counts_within(
+    gains: list[FloatArray], dictionary_size: int, budget: int, held: Sequence[int] | None = None
+) -> list[int]:
     """Return how many centres each leaf gets so that weights and packed index sets cost at most `budget` numbers.
 
     gains: per leaf, (k,) what each further centre of its own order brings. The leaf whose next centre brings the most
     is served first; a leaf's gains are taken as falling (a later larger one is smoothed over those before it).
+    held: per leaf, how many of its first centres it has in any case.
     """
-    falling = [_falling(g) for g in gains]
-    counts = [0] * len(gains)
-    spent = 0
-    costs = [0] * len(gains)
-    heap = [(-float(f[0]), leaf) for leaf, f in enumerate(falling) if f.size]
+    counts = list(held) if held is not None else [0] * len(gains)
+    falling = [np.concatenate([np.zeros(k), _falling(g[k:])]) for g, k in zip(gains, counts, strict=True)]
+    costs = [k + subset_numbers(dictionary_size, k) for k in counts]
+    spent = sum(costs)
+    heap = [(-float(f[k]), leaf) for leaf, (f, k) in enumerate(zip(falling, counts, strict=True)) if f.size > k]
     heapq.heapify(heap)
     while heap:
         _, leaf = heapq.heappop(heap)

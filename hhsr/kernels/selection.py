@@ -82,14 +82,14 @@ def transposed(pointer, index, value, columns):
 
 
 @njit(cache=True, nogil=True)
-def orthogonal_selection(pointer, index, value, scale, target, columns, count, ridge):
+def orthogonal_selection(pointer, index, value, scale, target, columns, count, ridge, held):
     """Choose atoms one by one, each the one that lowers Σ (scale_i · (A w)_i − target_i)² + ridge·|w|² the most.
 
     Pivoted Cholesky of the normal equations, whose columns are formed only for the atoms chosen. It is held in single
     precision, which chooses the same atoms in a third of the time; the weights are solved again in double.
 
     pointer, index, value: rows of A, compressed. scale, target: (n,). count: atoms at most.
-    ridge: in units of the mean diagonal of the normal matrix.
+    ridge: in units of the normal matrix's mean diagonal. held: atoms that are chosen before any other, in this order.
     Returns (k,) atoms in order, (k,) falls of the sum of squares, (k, k) lower triangle L of the chosen atoms' normal
     matrix and (k,) y with L y = right side, so that the weights of the first m solve L[:m, :m]ᵀ w = y[:m].
     """
@@ -119,7 +119,11 @@ def orthogonal_selection(pointer, index, value, scale, target, columns, count, r
     column = np.empty(columns)
     for step in range(count):
         best, best_gain = -1, 0.0
-        for j in range(columns):
+        if step < held.shape[0]:
+            best = held[step]
+            rest[best] = max(rest[best], 1e-6 * full[best])
+            best_gain = pull[best] * pull[best] / rest[best]
+        for j in range(columns if best < 0 else 0):
             if rest[j] > 1e-3 * full[j] and diagonal[j] > 1e-6 * floor:
                 gain = pull[j] * pull[j] / rest[j]
                 if gain > best_gain:
@@ -171,6 +175,31 @@ def back_substituted(triangle, right, count):
             w[a] -= triangle[b, a] * w[b]
         w[a] /= triangle[a, a]
     return w
+
+
+@njit(cache=True, nogil=True)
+def drop_costs(triangle, right):
+    """Return (k,) by how much the sum of squares rises when one chosen atom is dropped and the others are fitted again.
+
+    w_j² / (G⁻¹)_jj for the normal matrix G = L Lᵀ.
+    """
+    k = right.shape[0]
+    weights = back_substituted(triangle, right, k)
+    inverse = np.zeros((k, k))
+    for a in range(k):
+        inverse[a, a] = 1.0 / triangle[a, a]
+        for b in range(a):
+            total = 0.0
+            for c in range(b, a):
+                total += triangle[a, c] * inverse[c, b]
+            inverse[a, b] = -total / triangle[a, a]
+    costs = np.empty(k)
+    for b in range(k):
+        total = 0.0
+        for a in range(b, k):
+            total += inverse[a, b] * inverse[a, b]
+        costs[b] = weights[b] * weights[b] / total
+    return costs
 
 
 @njit(cache=True, nogil=True)
