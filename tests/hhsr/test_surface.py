@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from hhsr.compiled import compile_tree
 from hhsr.errors import InputError, SurfaceError
 from hhsr.evaluate import leaf_radius
 from hhsr.model import (
@@ -304,6 +303,9 @@ def test_a_band_under_a_cut_and_a_band_over_it() -> None:
     tables = tables_of(whole)
     mesh = reconstruct(Tree(whole, NO_POSE), 0.02, [tables[id(c)] for c in cuts(whole)])
     check(Tree(whole, NO_POSE), mesh, tables)
+    by_itself = reconstruct(Tree(whole, NO_POSE), 0.02)
+    assert by_itself.is_watertight
+    assert by_itself.volume == pytest.approx(mesh.volume, rel=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -323,9 +325,9 @@ def test_bands_that_hardly_hold(seed: int, tmp_path: Path) -> None:
         return Cut(cut.normal_angles, cut.offset, float(rng.uniform(0.2, 3.0)), lobes, cut.left, cut.right)
 
     tree = Tree(wild(1 + seed % 2), NO_POSE)
-    tables = compile_tree(tree).band_tables
-    mesh = reconstruct(tree, 0.1)
-    check(tree, mesh, {id(c): list(t) for c, t in zip(cuts(tree.root), tables, strict=True)}, seed)
+    tables = tables_of(tree.root)
+    mesh = reconstruct(tree, 0.1, [tables[id(c)] for c in cuts(tree.root)])
+    check(tree, mesh, tables, seed)
     mesh.export(tmp_path / "shape.ply")
     assert trimesh.load(tmp_path / "shape.ply").is_watertight
 
