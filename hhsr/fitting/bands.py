@@ -48,8 +48,8 @@ def wanted_half_width(source: Source, options: FitOptions) -> float:
 def outline(frame: FloatArray, offset: float, part: Part, source: Source, d: float, t_mm: float) -> Outline | None:
     """Return the source's section of a cut within a part's region, if one centre per lobe sees it at −d, 0 and +d.
 
-    Lobes of less than 2 % of the section's area are left to the step faces. None where a lobe has a hole, or some centre
-    would miss more than 2 % of an outline.
+    Lobes of less than 2 % of the section's area are left to the step faces. None where a lobe has a hole, or
+    some centre would miss more than 2 % of an outline.
     """
     heights = (-d, 0.0, d) if d > 0.0 else (0.0,)
     sections = [_lobes_in(frame, offset + h, part, source, t_mm) for h in heights]
@@ -129,8 +129,9 @@ def add_bands(node: Node, part: Part, source: Source, options: FitOptions, room:
     right, room = add_bands(node.right, sides[1], source, options, room)
     node = replace(node, left=left, right=right)
     d = wanted_half_width(source, options)
+    children = [Shape(Tree(child, frozen(np.zeros(6)))) for child in (left, right)]
     for _ in range(HALVINGS + 1 if d > 0.0 else 0):
-        banded = banded_cut(node, part, source, options, d)
+        banded = banded_cut(node, children, part, source, options, d)
         if banded is not None:
             cost = banded.own_parameters - node.own_parameters
             if room is not None and cost > room:
@@ -140,8 +141,10 @@ def add_bands(node: Node, part: Part, source: Source, options: FitOptions, room:
     return node, room
 
 
-def banded_cut(node: Cut, part: Part, source: Source, options: FitOptions, d: float) -> Cut | None:
-    """Return the cut with a band of half width d (mm), or None where that is not valid on the fitted solid."""
+def banded_cut(
+    node: Cut, children: list[Shape], part: Part, source: Source, options: FitOptions, d: float
+) -> Cut | None:
+    """Return the cut with a band of half width d (mm), or None where that is not valid on its fitted children."""
     found = outline(np.asarray(node.frame), node.offset, part, source, d, threshold_mm(source, options))
     if found is None:
         return None
@@ -154,16 +157,15 @@ def banded_cut(node: Cut, part: Part, source: Source, options: FitOptions, d: fl
         contours.append(rounded_contour(contour, source.extent_mm))
     step = power_step(source.extent_mm, LENGTH_BITS)
     banded = replace(node, half_width=max(float(to_step(np.array(d), step)), step), contours=tuple(contours))
-    return banded if is_valid(banded, part, source.extent_mm) else None
+    return banded if is_valid(banded, children, part, source.extent_mm) else None
 
 
-def is_valid(cut: Cut, part: Part, extent_mm: float) -> bool:
-    """Return whether a cut's band is valid on its fitted children (DESIGN §2).
+def is_valid(cut: Cut, children: list[Shape], part: Part, extent_mm: float) -> bool:
+    """Return whether a cut's band is valid on its fitted children, left and right (DESIGN §2).
 
-    Each side's section at ∓d has in every lobe one exit along each of 256 in-plane rays from the lobe's centre (within the
-    region); r > 0 throughout; lobes are disjoint; and the lobes hold all but 5 % of each side's section.
+    Each side's section at ∓d has in every lobe one exit along each of 256 in-plane rays from the lobe's centre (within
+    the region); r > 0 throughout; lobes are disjoint; and the lobes hold all but 5 % of each side's section.
     """
-    children = [Shape(Tree(child, frozen(np.zeros(6)))) for child in (cut.left, cut.right)]
     tables = []
     for side, child in zip((-1, 1), children, strict=True):
         radii = [_exits(contour, cut, side, child, part, extent_mm) for contour in cut.contours]
@@ -185,10 +187,8 @@ def is_valid(cut: Cut, part: Part, extent_mm: float) -> bool:
     )
 
 
-def _exits(
-    contour: Contour, cut: Cut, side: int, child: Shape, part: Part, extent_mm: float
-) -> FloatArray | None:
-    """Return (256,) mm where rays from a lobe's centre leave a child's solid at h = side · d; None: not exactly once."""
+def _exits(contour: Contour, cut: Cut, side: int, child: Shape, part: Part, extent_mm: float) -> FloatArray | None:
+    """Return (256,) mm where rays from a lobe's centre leave a child's solid at h = side · d; None: not just once."""
     if isinstance(child.tree.root, RetainedPart) and not len(child.tree.root.faces):
         return None
     height = cut.offset + side * cut.half_width

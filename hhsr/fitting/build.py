@@ -58,9 +58,7 @@ def fit(surface: Surface, options: FitOptions | None = None) -> Shape:
     shape = Shape(tree, provenance)
     measured = measure(shape, vertices, faces, options.samples, options.seed)
     report = {**measured.report, "leaves": leaf_figures(tree)}
-    return Shape(
-        tree, replace(provenance, fit_error=measured.error, leaf_errors=measured.leaf_errors, report=report)
-    )
+    return Shape(tree, replace(provenance, fit_error=measured.error, leaf_errors=measured.leaf_errors, report=report))
 
 
 def _kept_whole(vertices: FloatArray, faces: IntArray) -> Tree:

@@ -1,8 +1,9 @@
-"""The 2-D intersection shape of a cut: lobes of an exact plane section, each a radius over in-plane angles (DESIGN §2)."""
+"""The 2-D intersection shape of a cut: lobes of a plane section, each a radius over in-plane angles (DESIGN §2)."""
 
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ AXIS_STEPS = 20
 
 
 class Lobe(NamedTuple):
-    """points: (n, 2) mm, the section's loop in the plane's axes, in walking order. seen: (n,) bool, within the region."""
+    """points: (n, 2) mm, the section's loop in the plane's axes, in walking order. seen: (n,) bool, in the region."""
 
     points: FloatArray
     seen: np.ndarray
@@ -42,7 +43,7 @@ def section_lobes(
         spacing_mm,
     )
     flat = points @ frame[:2].T
-    return [flat[a:b] for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    return [flat[a:b] for a, b in pairwise(starts)]
 
 
 def loop_area(points: FloatArray) -> float:
@@ -92,7 +93,7 @@ def star_centre(loops: list[FloatArray], within: FloatArray) -> tuple[FloatArray
     return grid[best], float(share[best])
 
 
-def fit_contour(lobe: Lobe, centre: FloatArray, goal_mm: float, most_weights: int = WEIGHT_COUNTS[-1]) -> Contour | None:
+def fit_contour(lobe: Lobe, centre: FloatArray, goal_mm: float) -> Contour | None:
     """Return a lobe's contour about a centre: half axes by Gauss–Newton, then as few uniform weights as meet the goal.
 
     Only points within the region count; elsewhere the ridge holds the contour to its superellipse. None where too few
@@ -106,8 +107,6 @@ def fit_contour(lobe: Lobe, centre: FloatArray, goal_mm: float, most_weights: in
     base = Contour(frozen(centre), frozen(_half_axes(away / radii[:, None], radii)))
     best = base
     for count in WEIGHT_COUNTS:
-        if count > most_weights:
-            break
         best = with_weights(base, angles, radii, count)
         if float(np.abs(contour_radius(best, angles) - radii).mean()) <= goal_mm:
             break

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from hhsr.fitting.mutex import MutexPairs
 from hhsr.model import FloatArray
 
-
 LEAST_SHARE = 0.01
 
 

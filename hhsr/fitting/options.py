@@ -19,12 +19,12 @@ class FitOptions:
     Parameters
     ----------
     max_parameters : most numbers that may be stored (`Shape.parameters` ≤ this), ≥ 16; None: what the error asks for.
-    max_mean_error_mm, max_error_mm : stop spending when the two-sided mean / the sampled maximum is below; None: no goal.
+    max_mean_error_mm, max_error_mm : stop spending when the two-sided mean / sampled maximum is below; None: no goal.
     retain : keep the whole mesh as one retained part (a vessel tree); the budget is then not asked.
     recipe : "default", or "paper": mutex cuts by Eq. 9, superquadrics with spline exponents, uniform centres, bands.
     seed : of every random choice.
-    t_mm : two points of a contour map farther apart than this are not neighbours (PAPER §3.1); None: 1/40 of the longest
-        side.
+    t_mm : two points of a contour map farther apart than this are not neighbours (PAPER §3.1); None: 1/40 of the
+        longest side.
     t1 : a part is cut while its pairs weigh more than this share of the root's, 0 … 1.
     t2_mm3 : a part whose bounding box is smaller is retained.
     t3_mm : a part whose mean error of fit is larger is retained; None: 10 % of the longest side.
@@ -75,7 +75,7 @@ class FitOptions:
         max_parameters: int | None = None,
         **others: Any,
     ) -> FitOptions:
-        """Return the options of the paper's own fit (PAPER §3–§5): its four thresholds, and a budget if one is wanted."""
+        """Return the options of the paper's own fit (PAPER §3–§5): its four thresholds, and a budget if wanted."""
         return FitOptions(
             recipe="paper", t_mm=t_mm, t1=t1, t2_mm3=t2_mm3, t3_mm=t3_mm, max_parameters=max_parameters, **others
         )
@@ -93,7 +93,7 @@ def _whole(name: str, value: Any, low: int, high: int) -> None:
 
 
 def _number(name: str, value: Any, low: float, high: float) -> None:
-    """Raise InputError unless `value` is None or a number in [low, high] (an infinite one only where that is the end)."""
+    """Raise InputError unless `value` is None or a number in [low, high] (infinite only where that is the end)."""
     if value is None:
         return
     if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value) or not low <= value <= high:

@@ -1,4 +1,4 @@
-"""The paper's fit (Algorithm 1): mutex cuts, superquadrics with splines, uniform centres, one budget over all leaves."""
+"""The paper's fit (Algorithm 1): mutex cuts, superquadrics with splines, uniform centres, one budget over all."""
 
 from __future__ import annotations
 

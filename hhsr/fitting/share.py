@@ -14,8 +14,6 @@ ROWS_PER_CENTRE = 8
 FILLING_STEPS = 7
 
 
-
-
 class Ladder:
     """Fits of one leaf with ever more centres; each is made when it is asked for, and kept."""
 

@@ -13,6 +13,7 @@ from hhsr.model import FloatArray, IntArray
 from hhsr.triangle_tree import TriangleTree
 
 FIT_SAMPLES = 30_000
+CAP_SAMPLES = 400
 
 
 class Source:
@@ -30,6 +31,7 @@ class Source:
         self.tree = TriangleTree(self.vertices, self.faces)
         self.samples: Samples = area_samples(self.vertices, self.faces, samples, seed)
         self._inside: dict[int, tuple[Part, IntArray]] = {}
+        self._caps: dict[int, tuple[Part, FloatArray, float]] = {}
 
     @cached_property
     def area_mm2(self) -> float:
@@ -52,6 +54,17 @@ class Source:
             known = part, np.flatnonzero(part.holds(self.samples.points))
             self._inside[id(part)] = known
         return known[1]
+
+    def cap_samples(self, part: Part) -> tuple[FloatArray, float]:
+        """Return points (n, 3) spread over the solid's sections that bound a part, and the mm² that each stands for."""
+        known = self._caps.get(id(part))
+        if known is None or known[0] is not part:
+            faces = part.faces[part.capped()] if part.planes else part.faces[:0]
+            area = float(face_areas(part.vertices, faces).sum())
+            points = area_samples(part.vertices, faces, CAP_SAMPLES).points if area > 0.0 else np.zeros((0, 3))
+            known = part, points, area / CAP_SAMPLES
+            self._caps[id(part)] = known
+        return known[1], known[2]
 
 
 def threshold_mm(source: Source, options: FitOptions) -> float:

@@ -19,7 +19,8 @@ ON_PLANE_SHARE = 1e-7
 class Part:
     """A piece of the source: closed triangles, and the half spaces that its region is made of.
 
-    vertices: (n, 3) mm. faces: (m, 3). planes: pairs of a plane and the side of it (+1 right, −1 left) that the part is on.
+    vertices: (n, 3) mm. faces: (m, 3). planes: pairs of a plane and the side of it (+1 right, −1 left) of
+    the part.
     """
 
     vertices: FloatArray

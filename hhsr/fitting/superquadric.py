@@ -66,7 +66,7 @@ def fit_superquadric(
     """
     size = float(np.sqrt(((points - start.centre) ** 2).sum(axis=1)).max())
     unit = (points - start.centre) / max(size, _TINY)
-    reach = np.sqrt((((unit @ rotation_matrix(start.rotation)) ** 2).mean(axis=0)))
+    reach = np.sqrt(((unit @ rotation_matrix(start.rotation)) ** 2).mean(axis=0))
     axes = np.log(np.maximum(1.7 * reach, 0.05))
     layout = _Layout(rotate, False, 0, 0, leash)
     values = np.concatenate([np.zeros(3), start.rotation if rotate else np.zeros(0), axes])
@@ -173,10 +173,10 @@ def _solve(layout: _Layout, values: FloatArray, unit: FloatArray, fixed: FloatAr
 
 
 def _bounds(layout: _Layout, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return the range of each unknown: half axes from 1/50 to 5 radii of the part, exponents 0.104 … 1.896."""
+    """Return the range of each unknown: half axes from 1/20 to 3 radii of the part, exponents 0.104 … 1.896."""
     low, high = np.full(count, -10.0), np.full(count, 10.0)
     axes = slice(6 if layout.rotate else 3, count - layout.azimuth - layout.elevation)
-    low[axes], high[axes] = math.log(0.02), math.log(5.0)
+    low[axes], high[axes] = math.log(0.05), math.log(3.0)
     logits = slice(count - layout.azimuth - layout.elevation, count)
     low[logits], high[logits] = -6.0, 6.0
     return low, high
@@ -212,7 +212,7 @@ def _constraint_rows(
     layout: _Layout, values: FloatArray, fixed: FloatArray, data: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return the rows of C1 (|f‴| > T), C3 (volume), the centre's leash and the logits' ridge, and their Jacobian."""
-    _, _, log_axes, azimuth, elevation = layout.split(values, fixed)
+    log_axes = layout.split(values, fixed)[2]
     share = ROW_SHARE * math.sqrt(data)
     at = 6 if layout.rotate else 3
     columns = values.size
@@ -254,9 +254,7 @@ def _right_jacobian(vector: FloatArray) -> FloatArray:
     if angle < 1e-6:
         return np.eye(3) - 0.5 * cross
     return np.asarray(
-        np.eye(3)
-        - (1.0 - math.cos(angle)) / angle**2 * cross
-        + (angle - math.sin(angle)) / angle**3 * (cross @ cross)
+        np.eye(3) - (1.0 - math.cos(angle)) / angle**2 * cross + (angle - math.sin(angle)) / angle**3 * (cross @ cross)
     )
 
 
@@ -267,7 +265,7 @@ def norm_gradients(
 
     Returns
     -------
-    N (n,); by the point (n, 3); by the logarithms of the half axes (n, 6); by the azimuth logits; by the elevation logits.
+    N (n,); by the point (n, 3); by the logarithms of the half axes (n, 6); by azimuth logits; by elevation logits.
     """
     ring = np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2) + _TINY
     square = ring**2 + points[:, 2] ** 2
@@ -325,7 +323,7 @@ def _exponent(periodic: bool, logits: FloatArray, share: FloatArray) -> tuple[Fl
 def _p_norm_gradients(
     x: FloatArray, y: FloatArray, exponent: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return M = (x^(2/ε) + y^(2/ε))^(ε/2) of x, y > 0, and its derivatives by x, y and ε (M times half the entropy)."""
+    """Return M = (x^(2/ε) + y^(2/ε))^(ε/2) of x, y > 0, its derivatives by x, y and ε (M times half the entropy)."""
     power = 2.0 / exponent
     large = np.maximum(x, y)
     log_x, log_y = power * np.log(x / large), power * np.log(y / large)

@@ -1,4 +1,4 @@
-"""A leaf of the paper's kind: a superquadric, and a scale field on uniform centres by linear least squares (PAPER §2.2)."""
+"""A leaf of the paper's kind: a superquadric, a scale field on uniform centres by linear least squares (PAPER §2.2)."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ LEAST_COSINE = 0.2
 ROUNDS = 3
 SLACK_SHARE = 0.01
 EMPTY_SHARE = 0.3
+NEARLY = 0.01
 
 
 class LeafRows(NamedTuple):
@@ -41,8 +42,9 @@ class LeafRows(NamedTuple):
 
     directions: (n, 3) unit. radii: (n,) mm of the surface. cosines: (n,) of the angle between direction and normal.
     areas: (n,) mm² that each stands for. empty: (m, 3) unit directions with no surface of the part, reach: (m,) mm how
-    far the solid runs there at least, empty_areas: (m,). hidden, hidden_radii: (h, 3), (h,) surface that looks back at
-    the centre; no row follows it, but what is missed there is counted.
+    far the solid runs there at least, empty_areas: (m,). hidden, hidden_radii, hidden_areas: (h, 3), (h,), (h,) surface
+    of the shape, and section of the solid on the region's planes, that lies behind other surface; no row follows it,
+    but what is missed there is counted.
     """
 
     directions: FloatArray
@@ -54,15 +56,16 @@ class LeafRows(NamedTuple):
     empty_areas: FloatArray
     hidden: FloatArray
     hidden_radii: FloatArray
+    hidden_areas: FloatArray
 
 
 def leaf_rows(
     part: Part, source: Source, centre: FloatArray, rotation: FloatArray, most: int = 4000, rays: int = 1000
 ) -> LeafRows:
-    """Return the rows of a part about a centre inside it: its surface samples, and the rays that meet none.
+    """Return the rows of a part about a centre inside it: its surface samples, and rays where they meet it or do not.
 
-    A sample that looks back at the centre lies behind another piece of the surface: no radius can follow both, and the
-    nearer one of the pair is the true one along the ray; it is left out.
+    A sample that looks back at the centre lies behind another piece of the surface: no radius can follow both; it is
+    left out. Leaving out all that is behind other surface made livers and the bunny worse.
     """
     turn = rotation_matrix(rotation)
     index = source.inside(part)
@@ -75,22 +78,40 @@ def leaf_rows(
     share = source.area_mm2 * source.inside(part).size / source.samples.points.shape[0] / max(index.size, 1)
     directions = fibonacci_sphere(rays)
     reach = part.exits(np.broadcast_to(centre, directions.shape), directions)
-    finite = np.flatnonzero(np.isfinite(reach) & (reach < 4.0 * source.extent_mm))
-    limit = max(float(reach[finite].max()), 1e-9) if finite.size else 1.0
-    hit, _ = source.tree.first_hit(np.broadcast_to(centre, directions.shape), directions * limit)
-    empty = finite[~(hit[finite] * limit <= reach[finite])]
-    steps = reach[empty] ** 2 * 4.0 * math.pi / rays
+    behind_unit, behind_radii, behind_area = _caps_behind(part, source, centre)
+    hit, face = source.tree.first_hit(np.broadcast_to(centre, directions.shape), directions)
+    met = np.flatnonzero(hit <= reach)
+    corners = source.vertices[source.faces[face[met]]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    slopes = (directions[met] * normals).sum(axis=1) / np.maximum(np.sqrt((normals**2).sum(axis=1)), 1e-300)
+    empty = np.flatnonzero(~(hit <= reach) & (reach < 4.0 * source.extent_mm))
+    most_area = 10.0 * share * max(index.size, 1) / rays
+    ray_areas = EMPTY_SHARE * np.minimum(np.where(hit <= reach, hit, reach) ** 2 * 4.0 * math.pi / rays, most_area)
     return LeafRows(
-        np.ascontiguousarray(unit[kept] @ turn),
-        radii[kept],
-        cosines[kept],
-        np.full(int(kept.sum()), share),
+        np.ascontiguousarray(np.concatenate([unit[kept], directions[met]]) @ turn),
+        np.concatenate([radii[kept], hit[met]]),
+        np.concatenate([cosines[kept], np.maximum(slopes, 0.0)]),
+        np.concatenate([np.full(int(kept.sum()), share), ray_areas[met]]),
         np.ascontiguousarray(directions[empty] @ turn),
         reach[empty],
-        EMPTY_SHARE * np.minimum(steps, 10.0 * share * max(index.size, 1) / rays),
-        np.ascontiguousarray(unit[~kept] @ turn),
-        radii[~kept],
+        ray_areas[empty],
+        np.ascontiguousarray(np.concatenate([unit[~kept], behind_unit]) @ turn),
+        np.concatenate([radii[~kept], behind_radii]),
+        np.concatenate([np.full(int((~kept).sum()), share), np.full(behind_radii.size, behind_area)]),
     )
+
+
+def _caps_behind(part: Part, source: Source, centre: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return unit directions and radii of points of the region's sections that lie behind surface, and the mm² of each.
+
+    What a leaf cannot see of its own section becomes a step face deep inside the solid.
+    """
+    points, area = source.cap_samples(part)
+    away = points - centre
+    radii = np.sqrt((away**2).sum(axis=1))
+    seen, _ = source.tree.first_hit(np.broadcast_to(centre, away.shape), away)
+    behind = (seen < 1.0 - NEARLY) & (radii > 1e-9)
+    return away[behind] / radii[behind, None], radii[behind], area
 
 
 def _bases(leaf: ModelLeaf, rows: LeafRows) -> tuple[FloatArray, FloatArray]:
@@ -107,7 +128,7 @@ def covered_centres(grid: CentreGrid, rows: LeafRows) -> IntArray:
 
 
 class FieldFit(NamedTuple):
-    """leaf: with its field. mean_mm: mean miss of its surface, hidden surface included. area_error: Σ area · miss, mm³."""
+    """leaf: with its field. mean_mm: mean miss of its surface, hidden or not. area_error: Σ area · miss, mm³."""
 
     leaf: ModelLeaf
     mean_mm: float
@@ -118,8 +139,8 @@ def fit_field(leaf: ModelLeaf, rows: LeafRows, count: int) -> FieldFit:
     """Return the leaf with a scale field on those of `count` uniform centres that its data cover.
 
     Linear least squares (PAPER §2.2) on Λ w = 1 − β, each row in mm of true distance (|cos γ| of the radial miss) by
-    the area it stands for; three rounds, reweighted towards the mean of absolute misses; an empty direction is a row only
-    while the leaf ends there before the region does.
+    the area it stands for; three rounds, reweighted towards the mean of absolute misses; an empty direction is a row
+    only while the leaf ends there before the region does.
     """
     base, base_empty = _bases(leaf, rows)
     slope = base * np.maximum(rows.cosines, LEAST_COSINE)
@@ -150,12 +171,11 @@ def fit_field(leaf: ModelLeaf, rows: LeafRows, count: int) -> FieldFit:
 
 
 def _figures(field: ScaleField, leaf: ModelLeaf, miss: FloatArray, rows: LeafRows) -> FieldFit:
-    """Return the leaf with the field and what it misses: seen and hidden surface, and dents where the region is full."""
+    """Return the leaf with the field and what it misses: seen and hidden surface, dents where the region is full."""
     fitted = ModelLeaf(leaf.centre, leaf.rotation, leaf.superquadric, field)
-    each = float(rows.areas[0]) if rows.areas.size else 0.0
     total = float((miss * rows.areas).sum())
-    total += each * float(np.abs(leaf_radius(fitted, rows.hidden) - rows.hidden_radii).sum())
-    area = each * (rows.radii.size + rows.hidden_radii.size)
+    total += float((rows.hidden_areas * np.abs(leaf_radius(fitted, rows.hidden) - rows.hidden_radii)).sum())
+    area = float(rows.areas.sum() + rows.hidden_areas.sum())
     total += float((rows.empty_areas * np.maximum(rows.reach - leaf_radius(fitted, rows.empty), 0.0)).sum())
     return FieldFit(fitted, total / max(area, 1e-300), total)
 
@@ -176,9 +196,7 @@ def best_centre(part: Part, source: Source, seed: int, candidates: int = 12) -> 
     return inner[chosen[int(np.argmin(errors))]]
 
 
-def interior_points(
-    part: Part, source: Source, seed: int, count: int = 3000
-) -> tuple[FloatArray, FloatArray]:
+def interior_points(part: Part, source: Source, seed: int, count: int = 3000) -> tuple[FloatArray, FloatArray]:
     """Return points (n, 3) inside both part and solid, and their distance (n,) to surface and planes, mm."""
     random = np.random.default_rng(seed)
     low, high = part.vertices.min(axis=0), part.vertices.max(axis=0)

@@ -16,11 +16,7 @@ def sparse_rows(directions, centres, inverse_extents):
     filled = 0
     for i in range(n):
         for j in range(k):
-            dot = (
-                directions[i, 0] * centres[j, 0]
-                + directions[i, 1] * centres[j, 1]
-                + directions[i, 2] * centres[j, 2]
-            )
+            dot = directions[i, 0] * centres[j, 0] + directions[i, 1] * centres[j, 1] + directions[i, 2] * centres[j, 2]
             h = (1.0 - dot) * inverse_extents[j]
             if h < 1.0:
                 if filled == room:

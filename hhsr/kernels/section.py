@@ -1,4 +1,4 @@
-"""Plane sections of closed triangles, contour maps, and the pairs of points that no convex part can hold (PAPER §3.1)."""
+"""Plane sections of closed triangles, contour maps, and pairs of points that no convex part can hold (PAPER §3.1)."""
 
 import math
 
@@ -10,7 +10,7 @@ from numba import njit
 def plane_segments(vertices, faces, heights, offset):
     """Return the segments where the plane heights = offset meets the triangles.
 
-    vertices: (n, 3); faces: (m, 3); heights: (n,) of the vertices over some plane; a vertex on the plane counts as above.
+    vertices: (n, 3); faces: (m, 3); heights: (n,) of the vertices over some plane; a vertex on it counts as above.
     Returns points (k, 2, 3), keys (k, 2) of the mesh edges that the ends lie on, face (k,). On a closed mesh every key
     comes an even number of times, and ends of equal key are the same point to the bit.
     """
@@ -55,8 +55,8 @@ def plane_segments(vertices, faces, heights, offset):
 def chain_segments(keys):
     """Return the segment ends in walking order, and the offsets (chains + 1,) of each chain in it.
 
-    keys: (k, 2). An end 2 s + side stands for the point where segment s is entered. Loops close on themselves; where the
-    mesh is open a chain just ends.
+    keys: (k, 2). An end 2 s + side stands for the point where segment s is entered. Loops close on themselves; where
+    the mesh is open a chain just ends.
     """
     count = keys.shape[0]
     flat = keys.copy().reshape(2 * count)
@@ -112,7 +112,7 @@ def resample_chains(points, face, capped, walk, offsets, spacing):
             )
     starts = np.zeros(chains + 1, np.int64)
     for c in range(chains):
-        starts[c + 1] = starts[c] + max(3, int(math.ceil(lengths[c] / spacing)))
+        starts[c + 1] = starts[c] + max(3, math.ceil(lengths[c] / spacing))
     out = np.empty((starts[chains], 3))
     on_cap = np.zeros(starts[chains], np.bool_)
     for c in range(chains):
@@ -330,7 +330,9 @@ def pair_weights(vertices, faces, capped, pairs, normals, threshold):
     """Return the weight w (1/mm) of each pair (PAPER §3.1), (k,).
 
     p₂ goes through the pair, perpendicular to the plane that found it. Where its contour map joins the pair, w is the
-    largest local curvature of the component that holds it; else 0. pairs: (k, 2, 3); normals: (k, 3) of the first plane.
+    largest local curvature of the component that holds it; else 0.
+
+    pairs: (k, 2, 3). normals: (k, 3) of the plane that found each.
     """
     weights = np.zeros(pairs.shape[0])
     heights = np.empty(vertices.shape[0])
