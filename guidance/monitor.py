@@ -29,6 +29,7 @@ _TOOL_IS_TIP = np.eye(4)
 _TOOL_IS_TIP.flags.writeable = False
 _FAR_SHARE, _DEEP_SHARE = 0.05, 0.2
 _REFRESH_S = 0.1
+_SURE_SIGMAS = 5.0  # noise alone looks like a speed of three sigmas in 3 % of all frames, of five in none
 
 
 @dataclass
@@ -61,7 +62,7 @@ class Monitor:
     T_patient_tracker : (4, 4) array, optional
         Registration, mm. None is unregistered: everything is UNKNOWN.
     T_tool_tip : (4, 4) array, optional
-        Calibration: the tip's frame in the tool's, +z along the needle towards the tip. By default the tracker's tool is
+        Calibration: the tip's frame in the tool's, +z along the needle towards the tip. By default the tool is
         the tip itself. None is uncalibrated: everything is UNKNOWN.
     limits : Limits, optional
 
@@ -221,6 +222,7 @@ class Monitor:
             return State.CONTACT, f"the needle touches it ({distance:.2f} mm)"
         if forecast.seconds <= soon:
             span = f"{forecast.earliest_s:.1f} to {_text(forecast.latest_s)}"
+            span += "" if forecast.certain else ", or a near miss"
             return State.APPROACHING, (
                 f"contact in {forecast.seconds:.1f} s ({span}), {forecast.travel_mm:.1f} mm ahead at the present motion"
             )
@@ -232,7 +234,7 @@ class Monitor:
         """Whether the speed is known well enough to forecast by it."""
         m = self._motion
         assert m is not None
-        return m.speed_mm_s > max(self.limits.min_speed_mm_s, self.limits.coverage_sigmas * m.rate_spread_mm_s)
+        return m.speed_mm_s > max(self.limits.min_speed_mm_s, _SURE_SIGMAS * m.rate_spread_mm_s)
 
     def _settle(self, watch: _Watch, line: StructureReport, inside: bool) -> StructureReport:
         """Graver at once; better only when clearly better, for `hold_s` on end."""

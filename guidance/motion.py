@@ -122,8 +122,9 @@ class _VectorFilter:
         S = P[0, 0] + R
         self._bias = (1.0 - _BIAS_GAIN) * self._bias + _BIAS_GAIN * innovation
         if self._bias @ self._bias > _BIAS_LIMIT * S * _BIAS_GAIN / (2.0 - _BIAS_GAIN):
-            # the needle does not do what it did: the old velocity is worth little now
-            P = P + np.diag([float(self._bias @ self._bias), self._start_rate**2])
+            # the needle does not do what it did: its velocity is off by about this miss over the frames it took to show
+            miss = float(self._bias @ self._bias)
+            P = P + np.diag([miss, miss * (_BIAS_GAIN / dt) ** 2])
             S = P[0, 0] + R
             self._bias = np.zeros(3)
         gain = P[:, 0] / S

@@ -101,7 +101,7 @@ def draw_session(path: Path, scene: Scene, plans: Plans, outcomes: Sequence[Outc
         )
     axes = figure.axes[0]
     handles, labels = axes.get_legend_handles_labels()
-    axes.legend(handles, labels, loc="lower left", fontsize=9, framealpha=0.9)
+    axes.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.08), fontsize=8, ncols=4)
     _draw_gaps(figure.add_subplot(grid[1, 0]), scene, plans, main, colours)
     _draw_warnings(figure.add_subplot(grid[1, 1]), scene, wrong, colours)
     figure.suptitle(_headline(scene, plans), fontsize=13)
@@ -163,10 +163,11 @@ def _draw_slice(axes: Axes, scene: Scene, plane: _Plane, colours: dict[str, str]
         axes.plot([], [], color=colour, linewidth=6, alpha=0.6, label=_role_label(s))
     axes.set_aspect("equal")
     axes.set_xlim(-plane.half_mm, plane.half_mm)
-    axes.set_ylim(plane.half_mm, -plane.half_mm)
     axes.set_xlabel("mm across the path")
     axes.set_ylabel("depth, mm (the needle comes from above)")
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value + plane.depth_mm:.0f}")
+    ticks = np.arange(-200.0, 400.0, 20.0)
+    axes.set_yticks(ticks - plane.depth_mm, [f"{t:.0f}" for t in ticks])
+    axes.set_ylim(plane.half_mm, -plane.half_mm)
     for position, vector, where in (
         ((0.985, 0.5), plane.right, "right"),
         ((0.015, 0.5), -plane.right, "left"),
@@ -251,7 +252,7 @@ def _draw_warnings(axes: Axes, scene: Scene, outcome: Outcome | None, colours: d
     for s in scene.avoid:
         axes.plot(outcome.times, outcome.distances[s.name], color=colours[s.name], linewidth=1.8, label=s.name)
     axes.axhline(0.0, color=_INK, linewidth=1.0)
-    axes.set_ylim(-6.0, 40.0)
+    axes.set_ylim(-7.0 - 1.6 * len(met), 40.0)
     for row, w in enumerate(met):
         height, colour = -2.0 - 1.6 * row, colours[w.structure]
         if w.raised_s < np.inf:
@@ -282,5 +283,5 @@ def _shade(axes: Axes, times: Array, states: Sequence[State]) -> None:
             if end - times[start] > 0.8:
                 middle = 0.5 * (times[start] + end)
                 place = axes.get_xaxis_transform()
-                axes.text(middle, 0.985, states[start].value, transform=place, ha="center", va="top", fontsize=8)
+                axes.text(middle, 0.015, states[start].value, transform=place, ha="center", fontsize=8)
             start = k

@@ -31,13 +31,15 @@ class Forecast:
 
     `seconds` is the likeliest, [`earliest_s`, `latest_s`] what noise, the uncertain velocity and the uncertain time of
     the pose allow at the stated coverage, all counted from the report's time. inf: not within the horizon.
-    `travel_mm` is the tip's way until then.
+    `certain`: within that uncertainty contact cannot fail to come. Where it can (a thin vessel that the tip may just
+    pass), the interval says when contact comes if it comes. `travel_mm` is the tip's way until then.
     """
 
     seconds: float = inf
     earliest_s: float = inf
     latest_s: float = inf
     travel_mm: float = inf
+    certain: bool = False
 
     def later(self, by_s: float) -> Forecast:
         """The same forecast, counted from `by_s` seconds later."""
@@ -46,6 +48,7 @@ class Forecast:
             max(self.earliest_s - by_s, 0.0),
             max(self.latest_s - by_s, 0.0),
             self.travel_mm,
+            self.certain,
         )
 
 
@@ -97,6 +100,7 @@ class Event:
             "distance_mm": number(self.distance_mm),
             "seconds_to_contact": number(f.seconds),
             "seconds_to_contact_interval": [number(f.earliest_s), number(f.latest_s)],
+            "contact_certain": f.certain,
             "frame_number": self.frame_number,
             "role": self.role,
             "alarm": self.alarm,
@@ -183,5 +187,6 @@ def _structure_record(s: StructureReport) -> dict[str, Any]:
         "fit_error_mm": number(s.fit_error_mm),
         "seconds_to_contact": number(f.seconds),
         "seconds_to_contact_interval": [number(f.earliest_s), number(f.latest_s)],
+        "contact_certain": f.certain,
         "travel_mm": number(f.travel_mm),
     }

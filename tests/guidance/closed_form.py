@@ -69,7 +69,7 @@ class Rod:
         t = np.clip(((p - self.start) @ v) / vv, 0.0, 1.0) if vv > 0 else np.zeros(p.shape[:-1])
         return self.start + t[..., None] * v
 
-    def signed_distance(self, points):
+    def signed_distance(self, points, tolerance_mm=0.01):
         p = np.asarray(points, float)
         return np.linalg.norm(p - self._axis_point(p), axis=-1) - self.radius
 
