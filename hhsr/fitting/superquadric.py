@@ -19,6 +19,7 @@ THIRD_DERIVATIVE_BOUND = 500.0
 # still shrinks one that has none. The same share keeps logits finite and the centre near its start.
 ROW_SHARE = 0.01
 CENTRE_SHARE = 0.05
+TURN_SHARE = 0.02
 GROWTH = ((1, 1), (3, 3), (4, 4), (5, 5), (6, 6), (8, 8))
 LEAST_GAIN = 0.03
 MOST_STEPS = 40
@@ -222,13 +223,15 @@ def _constraint_rows(
     part = volume * pairs / pairs.sum(axis=1, keepdims=True)
     volume_row[at : at + (6 if layout.six else 3)] = part.ravel() if layout.six else part.sum(axis=1)
     leash = layout.leash * math.sqrt(data) * np.eye(3, columns)
+    # A ball or a cube does not say how it is turned: without this row its axes spin.
+    turn = TURN_SHARE * math.sqrt(data) * np.eye(3 if layout.rotate else 0, columns, k=3)
     logits = layout.azimuth + layout.elevation
     ridge = share * np.eye(logits, columns, k=columns - logits) if logits else np.zeros((0, columns))
     third = _third_derivatives(layout, columns)
     bend = third @ values
     over = ALPHA_SMOOTH * np.sign(bend) * np.maximum(np.abs(bend) - THIRD_DERIVATIVE_BOUND, 0.0)
-    rows = np.concatenate([[volume], leash @ values, ridge @ values, over])
-    jacobian = np.concatenate([volume_row[None], leash, ridge, third * (over != 0.0)[:, None] * ALPHA_SMOOTH])
+    rows = np.concatenate([[volume], leash @ values, turn @ values, ridge @ values, over])
+    jacobian = np.concatenate([volume_row[None], leash, turn, ridge, third * (over != 0.0)[:, None] * ALPHA_SMOOTH])
     return rows, jacobian
 
 
