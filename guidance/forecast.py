@@ -76,8 +76,8 @@ def forecast_contact(
         latest = _passed(shape, needle, motion, horizon, growth, grid, nominal)
     return Forecast(
         seconds=max(nominal - age_s, 0.0),
-        earliest_s=max(earliest - age_s - limits.timing_s, 0.0),
-        latest_s=max(latest - age_s + limits.timing_s, 0.0),
+        earliest_s=max(min(earliest, nominal) - age_s - limits.timing_s, 0.0),
+        latest_s=max(max(latest, nominal) - age_s + limits.timing_s, 0.0),
         travel_mm=max(nominal, 0.0) * motion.speed_mm_s,
         certain=certain,
     )
