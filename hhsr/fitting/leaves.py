@@ -40,12 +40,15 @@ SEED = 5
 
 
 class Fitted(NamedTuple):
-    """Leaves in the order of their pieces; mean and largest miss (mm); the share of samples that no centre sees."""
+    """Leaves in the order of their pieces; mean and largest miss (mm); the share of samples that no centre sees; which
+    leaf has the largest miss.
+    """
 
     leaves: list[ModelLeaf]
     mean: float
     largest: float
     unseen: float
+    worst: int
 
 
 def fit_leaves(solid: Solid, pieces: list[Piece], budget: int, thorough: bool) -> Fitted:
@@ -123,6 +126,7 @@ def _judged(solid: Solid, tasks: list[Task], leaves: list[ModelLeaf]) -> Fitted:
         sum(f.total for f in found) / count,
         max(f.largest for f in found),
         sum(f.unseen for f in found) / count,
+        int(np.argmax([f.largest for f in found])),
     )
 
 

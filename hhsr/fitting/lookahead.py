@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -18,6 +19,7 @@ OFFSETS = 11
 CENTRES = 12
 COARSE = 2000
 LEAST_SHARE = 0.004
+WORST_POWER = 2.0
 _NOTHING = RetainedPart(frozen(np.zeros((0, 3))), frozen(np.zeros((0, 3)), np.int64))
 
 
@@ -95,6 +97,26 @@ class Parting:
             slots[step.piece] = Cut(step.split.angles, step.split.offset, 0.0, (), slots[step.piece], right)
         return slots[0]
 
+    def with_cut(self, count: int, piece: int) -> Parting | None:
+        """Return the parting of `count` pieces with one more cut, through one piece and for its largest misses.
+
+        None where that piece cannot be cut.
+        """
+        split = best_split(self._solid, self.pieces(count)[piece], WORST_POWER)
+        if split is None:
+            return None
+        other = copy(self)
+        other._pieces, other._steps = self._pieces[:count], self._steps[: count - 1]
+        other._take(piece, split)
+        other._offers = [None] * (count + 1)
+        return other
+
+    def _take(self, at: int, split: Split) -> None:
+        """Note a cut."""
+        current = self._pieces[-1]
+        self._steps.append(Step(at, split))
+        self._pieces.append([*current[:at], split.left, *current[at + 1 :], split.right])
+
     def _cut(self) -> bool:
         """Make the next cut; return whether there was one."""
         current = self._pieces[-1]
@@ -106,8 +128,7 @@ class Parting:
         split = self._offers[at]
         if not isinstance(split, Split) or falls[at] <= 0.0:
             return False
-        self._steps.append(Step(at, split))
-        self._pieces.append([*current[:at], split.left, *current[at + 1 :], split.right])
+        self._take(at, split)
         self._offers[at] = "unknown"
         self._offers.append("unknown")
         return True
@@ -132,7 +153,7 @@ def best_centre(solid: Solid, members: IntArray, region: Region, power: float) -
         inner = np.array([int(((solid.inner - middle) ** 2).sum(axis=1).argmin())])
     tried = inner[_spread(solid.inner[inner], solid.depth[inner], CENTRES)]
     for _ in range(2):
-        gaps = hidden(solid, solid.inner[tried], few)
+        gaps = hidden(solid, solid.inner[tried], few) ** power
         values = misfits(solid.samples.points, solid.samples.normals, few, gaps, solid.inner[tried], power)
         at = int(values.argmin())
         best, least, unseen = tried[at], float(values[at]), int((gaps[at] > 0.0).sum())
@@ -165,7 +186,7 @@ def best_split(solid: Solid, piece: Piece, power: float) -> Split | None:
         return None
     chosen = solid.inner[inner[_spread(solid.inner[inner], solid.depth[inner], CENTRES)]]
     few = piece.members[:: max(piece.members.size // COARSE, 1)]
-    view = _View(solid, few, hidden(solid, chosen, few), chosen, least * few.size / piece.members.size, power)
+    view = _View(solid, few, hidden(solid, chosen, few) ** power, chosen, least * few.size / piece.members.size, power)
     normal, offset, value = view.best_plane(fibonacci_sphere(2 * DIRECTIONS)[:DIRECTIONS], None, None)
     spread = float(np.ptp(solid.samples.points[few], axis=0).max())
     angle = 0.25

@@ -24,6 +24,7 @@ MOST_PIECES = 32
 PATIENCE = 3
 WORST_SHARE = 0.01
 HIDDEN = 0.03
+SPIKE = 10.0
 
 
 class Choice(NamedTuple):
@@ -76,8 +77,22 @@ def _spent(solid: Solid, parting: Parting, budget: int) -> tuple[Node, Fitted]:
         )
     scouts = _scouts(solid, parting, budget)
     best = min(scouts, key=lambda choice: choice.score)
+    parting, best = _mended(solid, parting, best, budget)
     fitted = _fit(solid, parting, best.pieces, budget, thorough=True)
     return parting.tree(fitted.leaves), fitted
+
+
+def _mended(solid: Solid, parting: Parting, best: Choice, budget: int) -> tuple[Parting, Choice]:
+    """Return the parting with cuts through the pieces of the largest misses, as long as that pays."""
+    while best.fitted.largest > SPIKE * best.fitted.mean and best.pieces < budget // NUMBERS_A_PIECE:
+        cut = parting.with_cut(best.pieces, best.fitted.worst)
+        if cut is None:
+            break
+        tried = Choice(best.pieces + 1, _fit(solid, cut, best.pieces + 1, budget, thorough=False))
+        if tried.score >= best.score:
+            break
+        parting, best = cut, tried
+    return parting, best
 
 
 def _scouts(solid: Solid, parting: Parting, budget: int) -> list[Choice]:
