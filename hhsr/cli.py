@@ -1,4 +1,7 @@
-"""The command line: `hhsr fit | info | mesh | verify | query`. Exit codes: 0 done, 1 not verified, 2 bad input."""
+"""The command line: `hhsr fit | info | mesh | verify | query | compare | cohort`.
+
+Exit codes: 0 done, 1 not verified or some of a cohort failed, 2 bad input.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-_NOT_VERIFIED, _BAD_INPUT = 1, 2
+_NOT_ALL, _BAD_INPUT = 1, 2
 # A second measurement by other samples differs from the first by about a per cent of a mean error.
 _SAME_SHARE, _SAME_MM = 0.05, 0.005
 
@@ -164,7 +167,7 @@ def verify(
         _say(f"{source.name} is not the file that the shape was fitted to (its SHA-256 differs)")
     _print(f"{file} against {source.name}", figures, as_json)
     if not verified:
-        raise typer.Exit(_NOT_VERIFIED)
+        raise typer.Exit(_NOT_ALL)
 
 
 @app.command()
@@ -193,6 +196,75 @@ def query(
             write_columns(out, {"distance_mm": shape.signed_distance(rows)})
     asked = "segments" if asks_segments else "points"
     Console(highlight=False).print(f"{out}: {question.value} of {len(rows)} {asked}")
+
+
+@app.command()
+def compare(
+    source: SourceArgument,
+    max_parameters: Annotated[int, typer.Option("--max-parameters", help="The largest of three budgets.")] = 989,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write (.png).")] = Path("compare.png"),
+    label: LabelOption = None,
+    frame: FrameOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit by HHSR and by its comparators, at a quarter, half and all of a budget; print and draw the errors."""
+    from hhsr.baselines.compare import compare, draw
+    from hhsr.read import read_surface
+
+    with _bad_input_ends():
+        _require_folder(out)
+        surface = read_surface(source, frame=frame, label=label)
+        with Console(stderr=True).status("comparing") as status:
+            budgets = (max_parameters // 4, max_parameters // 2, max_parameters)
+            rows = compare(surface, budgets, progress=lambda method, n: status.update(f"{method}, {n} parameters"))
+        draw(rows, out, source.name)
+    if as_json:
+        typer.echo(json.dumps([row._asdict() for row in rows]))
+        return
+    table = Table("method", "parameters", "bytes", "mean mm", "p95 mm", "max mm", "seconds", title=escape(source.name))
+    for row in rows:
+        errors = (f"{value:.3f}" for value in (row.mean_mm, row.p95_mm, row.max_mm))
+        table.add_row(row.method, str(row.parameters), str(row.bytes), *errors, f"{row.seconds:.1f}")
+    Console(highlight=False).print(table)
+    _say(f"picture: {out}")
+
+
+@app.command()
+def cohort(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Meshes and label maps, in folders below too.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files and cohort.csv.")],
+    max_parameters: BudgetOption = None,
+    recipe: RecipeOption = "default",
+    seed: SeedOption = 0,
+    label: LabelOption = None,
+    frame: FrameOption = None,
+    force: ForceOption = False,
+    workers: Annotated[int | None, typer.Option("--jobs", min=1, help="Processes; without: one a core.")] = None,
+    scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler, tcp://….")] = None,
+) -> None:
+    """Fit every organ in a folder; killed and started again, it goes on where it was. Exit code 1 if some failed."""
+    from rich.progress import Progress
+
+    from hhsr.cohort import Job, fit_cohort, jobs_of
+    from hhsr.fitting import FitOptions
+
+    with _bad_input_ends():
+        options = FitOptions(max_parameters=max_parameters, recipe=recipe, seed=seed)  # type: ignore[arg-type]
+        reading = {"label": label, "frame": frame, "force": force}
+        jobs = jobs_of(folder, out, {k: v for k, v in reading.items() if v}, options.to_json())
+        with Progress(console=Console(stderr=True)) as bar:
+            task = bar.add_task("fitting", total=len(jobs))
+
+            def ended(job: Job, status: str) -> None:
+                bar.update(task, advance=1, description=f"{job.source.name}: {status}")
+
+            rows = fit_cohort(jobs, out, workers, scheduler, ended)
+    failed = [row for row in rows if row["status"] == "failed"]
+    for row in failed:
+        _say(f"{row['source']}: {row['message']}")
+    Console(highlight=False).print(f"{out}: {len(rows) - len(failed)} of {len(rows)} fitted, figures in cohort.csv")
+    if failed:
+        raise typer.Exit(_NOT_ALL)
 
 
 def _load(file: Path) -> Shape:
