@@ -166,7 +166,7 @@ def is_valid(cut: Cut, children: list[Shape], part: Part, extent_mm: float) -> b
     Each side's section at ∓d has in every lobe one exit along each of 256 in-plane rays from the lobe's centre (within
     the region); r > 0 throughout; lobes are disjoint; and the lobes hold all but 5 % of each side's section.
     """
-    tables = []
+    tables: list[list[FloatArray]] = []
     for side, child in zip((-1, 1), children, strict=True):
         radii = [_exits(contour, cut, side, child, part, extent_mm) for contour in cut.contours]
         if any(r is None for r in radii):
@@ -178,9 +178,8 @@ def is_valid(cut: Cut, children: list[Shape], part: Part, extent_mm: float) -> b
         if not (contour_radius(contour, angles) > low + 1e-9).all():
             return False
     middle = [contour_radius(contour, angles) for contour in cut.contours]
-    for radii in (tables[0], middle, tables[1]):
-        if not _disjoint(cut.contours, radii, angles):
-            return False
+    if not all(_disjoint(cut.contours, outlines, angles) for outlines in (tables[0], middle, tables[1])):
+        return False
     return all(
         _unclaimed(cut, side, child, part, table) <= MOST_UNCLAIMED
         for side, child, table in zip((-1, 1), children, tables, strict=True)

@@ -113,5 +113,5 @@ def _trim_open(
             break
         normal = side * plane.normal
         origin = normal * (side * plane.offset - margin_mm)
-        vertices, faces, _ = trimesh.intersections.slice_faces_plane(vertices, faces, normal, origin)
+        vertices, faces, _ = trimesh.intersections.slice_faces_plane(vertices, faces, normal, origin)  # type: ignore[no-untyped-call]
     return np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces, dtype=np.int64).reshape(-1, 3)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from hhsr.kernels.spline import HALF_RANGE, clamped_coefficients, periodic_coefficients
-from hhsr.model import FloatArray, Superquadric, frozen, rotation_matrix
+from hhsr.model import FloatArray, IntArray, Superquadric, frozen, rotation_matrix
 
 # PAPER §2.2: weights of the constraint terms C1, C3, and the bound T on a spline's third derivative (rad⁻³).
 ALPHA_SMOOTH = 1.0
@@ -123,21 +124,22 @@ def _grow(layout: _Layout, values: FloatArray, azimuth: int, elevation: int) -> 
     kept = values[: values.size - layout.azimuth - layout.elevation]
     new = [
         kept,
-        _evaluate(periodic_coefficients(old_azimuth), theta),
-        _evaluate(clamped_coefficients(old_elevation), phi),
+        _evaluate(True, old_azimuth, theta),
+        _evaluate(False, old_elevation, phi),
     ]
     return layout._replace(azimuth=azimuth, elevation=elevation), np.concatenate(new)
 
 
-def _evaluate(coefficients: FloatArray, share: FloatArray) -> FloatArray:
+def _evaluate(periodic: bool, logits: FloatArray, share: FloatArray) -> FloatArray:
     """Return the spline's values at shares in [0, 1]; 0 without knots."""
-    if coefficients.shape[0] == 0:
+    if logits.size == 0:
         return np.zeros(share.size)
+    coefficients = np.einsum("ksp,k->sp", _basis_table(logits.size, periodic), logits)
     segment, x = _segment(coefficients.shape[0], share)
     return np.asarray((coefficients[segment] * np.stack([x**0, x, x**2, x**3], axis=1)).sum(axis=1))
 
 
-def _segment(count: int, share: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _segment(count: int, share: FloatArray) -> tuple[IntArray, FloatArray]:
     """Return each share's segment and its position within, in [0, 1]."""
     segment = np.clip((share * count).astype(np.int64), 0, count - 1)
     return segment, share * count - segment
@@ -301,7 +303,7 @@ def norm_gradients(
 @lru_cache(maxsize=64)
 def _basis_table(count: int, periodic: bool) -> FloatArray:
     """Return the coefficients (knot, segment, power) of the splines that are 1 at one knot and 0 at the others."""
-    coefficients = periodic_coefficients if periodic else clamped_coefficients
+    coefficients: Callable[[FloatArray], FloatArray] = periodic_coefficients if periodic else clamped_coefficients
     return np.stack([coefficients(row) for row in np.eye(count)])
 
 

@@ -123,7 +123,8 @@ def _bases(leaf: ModelLeaf, rows: LeafRows) -> tuple[FloatArray, FloatArray]:
 def covered_centres(grid: CentreGrid, rows: LeafRows) -> IntArray:
     """Return the indices of the centres that data, not only empty directions, can tell apart from 0."""
     seen = np.ascontiguousarray(rows.directions[:: max(1, rows.radii.size // 1500)])
-    weight = column_squares(*sparse_rows(seen, grid.centres, 1.0 / grid.extents), grid.size)
+    offsets, index, value = sparse_rows(seen, grid.centres, 1.0 / grid.extents)
+    weight = column_squares(offsets, index, value, grid.size)
     return np.flatnonzero(weight > 0.02 * float(weight.max(initial=0.0)))
 
 
@@ -151,19 +152,20 @@ def fit_field(leaf: ModelLeaf, rows: LeafRows, count: int) -> FieldFit:
         miss = np.abs(slope * target)
         return _figures(ScaleField.none(), leaf, miss, rows)
     centres, inverse = np.ascontiguousarray(grid.centres[index]), 1.0 / grid.extents[index]
-    data = sparse_rows(rows.directions, centres, inverse)
-    empty = sparse_rows(rows.empty, centres, inverse)
+    data, data_index, data_value = sparse_rows(rows.directions, centres, inverse)
+    full, full_index, full_value = sparse_rows(rows.empty, centres, inverse)
     bound = 1.0 - (1.0 + SLACK_SHARE) * rows.reach / base_empty
     weights = np.zeros(index.size)
     robust = np.ones(base.size)
     for _ in range(ROUNDS):
-        short = row_products(*empty, weights) > bound
+        short = row_products(full, full_index, full_value, weights) > bound
         gram, right = np.zeros((index.size, index.size)), np.zeros(index.size)
-        add_normal_equations(*data, rows.areas * robust * slope**2, target, gram, right)
-        add_normal_equations(*empty, short * rows.empty_areas * (0.5 * base_empty) ** 2, bound, gram, right)
+        row, row_full = rows.areas * robust * slope**2, short * rows.empty_areas * (0.5 * base_empty) ** 2
+        add_normal_equations(data, data_index, data_value, row, target, gram, right)
+        add_normal_equations(full, full_index, full_value, row_full, bound, gram, right)
         gram[np.diag_indices_from(gram)] += RIDGE * np.trace(gram) / index.size + 1e-30
         weights = cho_solve(cho_factor(gram, lower=True, check_finite=False), right)
-        miss = np.abs(slope * (target - row_products(*data, weights)))
+        miss = np.abs(slope * (target - row_products(data, data_index, data_value, weights)))
         typical = float(np.average(miss, weights=rows.areas)) + 1e-12
         robust = 1.0 / np.maximum(miss / typical, 0.5)
     field = ScaleField(grid, frozen(index, np.int64), frozen(weights))
@@ -193,7 +195,7 @@ def best_centre(part: Part, source: Source, seed: int, candidates: int = 12) -> 
     for centre in inner[chosen]:
         rows = leaf_rows(part, source, centre, np.zeros(3), most=600, rays=300)
         errors.append(_cheap_error(centre, rows))
-    return inner[chosen[int(np.argmin(errors))]]
+    return np.asarray(inner[chosen[int(np.argmin(errors))]])
 
 
 def interior_points(part: Part, source: Source, seed: int, count: int = 3000) -> tuple[FloatArray, FloatArray]:

@@ -51,7 +51,7 @@ def test_chains_are_closed_loops_even_through_vertices() -> None:
         points, keys, _ = plane_segments(vertices, faces, heights, offset)
         walk, offsets = chain_segments(keys)
         assert offsets[-1] == len(keys)
-        for a, b in zip(offsets[:-1], offsets[1:], strict=True):
+        for a, b in zip(offsets[:-1].tolist(), offsets[1:].tolist(), strict=True):
             ends = walk[a:b]
             leaving = points[ends >> 1, 1 - (ends & 1)]
             entering = points[np.roll(ends, -1) >> 1, np.roll(ends, -1) & 1]
