@@ -18,7 +18,8 @@ POSE_NUMBERS = 6
 CUT_NUMBERS = 3
 USUAL_NUMBERS = 1000
 MOST_NUMBERS = 20_000
-SAMPLES = 12_000
+SAMPLES_A_NUMBER = 12
+SAMPLES = (6_000, 40_000)
 NUMBERS_A_PIECE = 16
 MOST_PIECES = 32
 PATIENCE = 3
@@ -52,7 +53,9 @@ def fit_default(vertices: FloatArray, faces: IntArray, options: FitOptions) -> N
     ------
     FitError : the budget cannot hold a pose and one leaf.
     """
-    solid = solid_of(vertices, faces, SAMPLES, options.seed)
+    expected = options.max_parameters if options.max_parameters is not None else USUAL_NUMBERS
+    samples = int(np.clip(SAMPLES_A_NUMBER * expected, *SAMPLES))
+    solid = solid_of(vertices, faces, samples, options.seed)
     parting = Parting(solid)
     if options.max_mean_error_mm is None and options.max_error_mm is None:
         budget = options.max_parameters if options.max_parameters is not None else USUAL_NUMBERS
