@@ -142,9 +142,10 @@ def _planes(scene: Scene, path: Trajectory, other: Array | None) -> tuple[_Plane
         side = np.eye(3)[int(np.argmin(np.abs(down)))]
         side = side - (side @ down) * down
     right = side / np.linalg.norm(side)
-    half = float(np.clip(0.5 * path.depth_mm + 35.0, 50.0, 110.0))
     depth = 0.5 * path.depth_mm
     origin = path.point(depth)
+    reach = 0.0 if other is None else float(np.abs((other - origin) @ np.stack([right, down], axis=1)).max()) + 8.0
+    half = float(np.clip(max(depth + 35.0, reach), 50.0, 140.0))
     return _Plane(origin, right, down, half, depth), _Plane(origin, np.cross(down, right), down, half, depth)
 
 
@@ -280,7 +281,7 @@ def _shade(axes: Axes, times: Array, states: Sequence[State]) -> None:
         if k == len(states) or states[k] is not states[start]:
             end = times[k] if k < len(states) else times[-1]
             axes.axvspan(times[start], end, color=_STATE_COLOURS[states[start]], zorder=0)
-            if end - times[start] > 0.8:
+            if end - times[start] > 0.08 * (times[-1] - times[0]):  # else the word does not fit
                 middle = 0.5 * (times[start] + end)
                 place = axes.get_xaxis_transform()
                 axes.text(middle, 0.015, states[start].value, transform=place, ha="center", fontsize=8)
