@@ -30,6 +30,7 @@ MOST_LEAVES = 64
 BASE_POINTS = 250
 LEAST_SAMPLES = 40
 T3_SHARE = 0.1
+WORTH_REFITTING = 16
 COUNTS = (0, 1, 2, 3, 5, 8, 12, 18, 27, 40)
 
 
@@ -62,9 +63,17 @@ def fit_paper(source: Source, options: FitOptions) -> Node:
     require_room(POSE_NUMBERS + BARE_LEAF_NUMBERS, options.max_parameters, "a pose and one superquadric")
     fitting = _Fitting(source, options)
     count = fitting.best_count()
-    tree = fitting.tree(count, fitting.reserve(count))
-    room = None if options.max_parameters is None else options.max_parameters - POSE_NUMBERS - tree.parameters
-    return add_bands(tree, source.root, source, options, room)[0]
+    bare = fitting.tree(count, fitting.reserve(count))
+    if options.max_parameters is None:
+        return add_bands(bare, source.root, source, options, None)[0]
+    budget = options.max_parameters - POSE_NUMBERS
+    banded, left = add_bands(bare, source.root, source, options, budget - bare.parameters)
+    if left is None or left < WORTH_REFITTING:
+        return banded
+    # What no band wanted goes back to the leaves; bands lean on the leaves, so they are tried again.
+    spent = banded.parameters - bare.parameters
+    bare = fitting.tree(count, spent)
+    return add_bands(bare, source.root, source, options, budget - bare.parameters)[0] if spent else bare
 
 
 def decompose(source: Source, options: FitOptions) -> tuple[Branch, int]:
