@@ -17,6 +17,8 @@ __all__ = ["Interrupted", "Session", "SilentLine"]
 
 #: speeds in the order in which they are tried, with the digit that COMM wants
 SPEEDS = {921600: "6", 230400: "A", 115200: "5", 57600: "4", 38400: "3", 19200: "2"}
+_PAUSE_S = 0.003
+_HANDLES = "[0-9A-F]{2}([0-9A-F]{5})*"
 _SLOW = ("INIT", "PINIT", "TSTART")
 _SLICE_S = 0.05
 _RESET_S = 7.0
@@ -111,14 +113,15 @@ class Session:
                 break
         self._reader.clear()
 
-    def ask_text(self, name: str, arguments: str = "", done: int | None = None) -> str:
-        """Ask for text; damaged and missing replies are asked for again, up to three times in all.
+    def ask_text(self, name: str, arguments: str = "", form: str = ".*", done: int | None = None) -> str:
+        """Ask for text of a form (a pattern); damaged, missing and foreign replies are asked for again, thrice in all.
 
-        `done` is the error code by which a device refuses to do again what it has done: after a reply that was lost,
-        it says OKAY.
+        A refusal is believed the second time only: the first may be the late copy of an answer to something else.
+        `done` is the error code by which a device refuses to do again what it has done: the second time it says OKAY.
         """
-        failure: ProtocolError | SilentLine | None = None
+        failure: ProtocolError | SilentLine | TrackerError | None = None
         for _ in range(3):
+            self._interrupt.wait(_PAUSE_S)  # a late copy of the last reply comes now, and is dropped
             try:
                 reply = self.ask(name, arguments)
             except (ProtocolError, SilentLine) as error:
@@ -127,18 +130,21 @@ class Session:
             except TrackerError as error:
                 if failure is not None and error.code == done:
                     return "OKAY"
-                raise
-            if isinstance(reply, str):
+                if isinstance(failure, TrackerError):
+                    raise
+                failure = error
+                self.settle()
+                continue
+            if isinstance(reply, str) and re.fullmatch(form, reply, re.DOTALL):
                 return reply
-            failure = ProtocolError(f"{name}: expected text, got {len(reply)} bytes")
+            failure = ProtocolError(f"{name}:{arguments[:24]}: expected {form}, got {reply[:60]!r}")
+            self.settle()
         assert failure is not None
         raise failure
 
     def order(self, name: str, arguments: str = "", done: int | None = None) -> None:
         """Ask for something to be done; `done` as in `ask_text`."""
-        reply = self.ask_text(name, arguments, done)
-        if reply != "OKAY" and not reply.startswith("WARNING"):
-            raise ProtocolError(f"{name}:{arguments[:24]}: expected OKAY, got {reply[:60]!r}")
+        self.ask_text(name, arguments, "OKAY|WARNING.*", done)
 
     def start_tracking(self) -> None:
         """Start tracking."""
@@ -154,6 +160,7 @@ class Session:
         """Bring the device from any state (fresh, tracking, another speed, mid-command) to initialised, 9600 baud."""
         self.line.open()
         self.speed = 9600
+        self.settle()
         try:
             self._initialise()
         except (SilentLine, ProtocolError, TrackerError):
@@ -256,11 +263,11 @@ class Session:
 
     def free_stale(self) -> None:
         """Free handles of tools that are gone, and of tools that an earlier session loaded."""
-        for handle, _ in decode_handles(self.ask_text("PHSR", "01")):
+        for handle, _ in decode_handles(self.ask_text("PHSR", "01", _HANDLES)):
             self.order("PHF", f"{handle:02X}", done=_NOT_ALLOCATED)
-        for handle, _ in decode_handles(self.ask_text("PHSR", "00")):
+        for handle, _ in decode_handles(self.ask_text("PHSR", "00", _HANDLES)):
             try:
-                location = self.ask_text("PHINF", f"{handle:02X}0020")
+                location = self.ask_text("PHINF", f"{handle:02X}0020", ".{14}|UNOCCUPIED")
             except TrackerError:
                 continue
             # device (8), system, 0 on a cable or 1 wireless, port (2), channel (2)
@@ -269,6 +276,7 @@ class Session:
 
     def load(self, definition: ToolDefinition) -> int:
         """Load a tool definition into a new port handle, initialise and enable it; return the handle."""
+        self.settle()  # asked only once: each request takes another handle
         reply = self.ask("PHRQ", "*********1****")
         if not isinstance(reply, str) or not re.fullmatch(r"[0-9A-F]{2}", reply):
             raise ProtocolError(f"PHRQ: expected a handle, got {reply[:20]!r}")
@@ -287,7 +295,9 @@ class Session:
         found: dict[int, str] = {}
         failed: set[int] = set()
         for _ in range(8):
-            waiting = [handle for handle, _ in decode_handles(self.ask_text("PHSR", "02")) if handle not in failed]
+            waiting = [
+                handle for handle, _ in decode_handles(self.ask_text("PHSR", "02", _HANDLES)) if handle not in failed
+            ]
             if not waiting:
                 break
             for handle in waiting:
@@ -295,16 +305,16 @@ class Session:
                     self.order("PINIT", f"{handle:02X}")
                 except TrackerError:
                     failed.add(handle)
-        for handle, _ in decode_handles(self.ask_text("PHSR", "03")):
+        for handle, _ in decode_handles(self.ask_text("PHSR", "03", _HANDLES)):
             self.order("PENA", f"{handle:02X}D")
-        for handle, _ in decode_handles(self.ask_text("PHSR", "04")):
+        for handle, _ in decode_handles(self.ask_text("PHSR", "04", _HANDLES)):
             if handle not in known:
                 found[handle] = self._part_number(handle)
         return found
 
     def _part_number(self, handle: int) -> str:
         try:
-            name = self.ask_text("PHINF", f"{handle:02X}0004").strip()
+            name = self.ask_text("PHINF", f"{handle:02X}0004", ".{20}|UNOCCUPIED").strip()
         except TrackerError:
             name = ""
         return name or f"port-{handle:02X}"

@@ -330,5 +330,5 @@ def test_replies_of_the_wrong_kind_are_protocol_errors() -> None:
         tracker.mode, kept = "BX2", tracker.mode
         assert tracker.read(2.0) is not None
         tracker.mode = kept
-        with pytest.raises(ProtocolError, match="expected text"):
+        with pytest.raises(ProtocolError, match="BX:0001"):
             tracker._session.ask_text("BX", "0001")

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 from guidance.errors import InputError
 from guidance.registration import RegistrationError, match_landmarks, register_landmarks, register_surface
 from guidance.rigid import invert, rotation_angle_rad, transform_points
+from hhsr.model import ModelLeaf, ScaleField, Superquadric, Tree
+from hhsr.shape import Shape
 
 LANDMARKS = np.array(
     [[104.3, 5, 20], [104.3, 45, 20], [104.3, 45, 0], [104.3, -5, 0], [-34.3, 45, 15], [-34.3, -5, 20], [-30, -5, 0]]
@@ -181,3 +183,28 @@ def test_surface_registration_refuses_nonsense() -> None:
         register_surface(digitised(egg, 10, 0, 0), egg, np.eye(4), trim=1.0)
     with pytest.raises(InputError, match="T_target_source"):
         register_surface(digitised(egg, 10, 0, 0), egg, 2.0 * np.eye(4))
+
+
+def test_points_on_an_organ_find_its_shape() -> None:
+    """The real thing: digitised points against an `hhsr.Shape` and its own closest point."""
+    half_axes = np.array([60.0, 52.0, 42.0, 42.0, 30.0, 24.0])
+    leaf = ModelLeaf(np.zeros(3), np.zeros(0), Superquadric(half_axes), ScaleField.none())
+    shape = Shape(Tree(leaf, np.zeros(6)))
+    generator = np.random.default_rng(6)
+    directions = generator.standard_normal((120, 3))
+    truth = (
+        directions
+        / np.linalg.norm(directions / np.where(directions > 0, half_axes[::2], half_axes[1::2]), axis=1)[:, None]
+    )
+    assert np.abs(shape.signed_distance(truth)).max() < 0.03
+    truth += 0.2 * generator.standard_normal(truth.shape)
+    T = motion(9)
+    points = transform_points(invert(T), truth)
+    start = np.eye(4)
+    start[:3, :3] = Rotation.from_rotvec([0.08, -0.06, 0.1]).as_matrix()
+    start[:3, 3] = [3.0, -2.0, 2.0]
+    result = register_surface(points, shape, start @ T)
+    assert result.converged
+    miss = transform_points(result.T_target_source, points) - truth
+    assert np.sqrt((miss**2).sum(axis=1).mean()) < 0.4
+    assert result.rms_mm < 0.2
