@@ -66,9 +66,11 @@ def contour_arrays(contour: Contour) -> ContourArrays:
 
 def leaf_radius(leaf: ModelLeaf, directions: ArrayLike) -> FloatArray:
     """Return the radius ρ (mm) of a leaf for (n, 3) directions in the leaf's frame, of any length > 0."""
-    return leaf_radii(np.ascontiguousarray(directions, dtype=np.float64), *leaf_arrays(leaf))
+    radii: FloatArray = leaf_radii(np.ascontiguousarray(directions, dtype=np.float64), *leaf_arrays(leaf))
+    return radii
 
 
 def contour_radius(contour: Contour, angles: ArrayLike) -> FloatArray:
     """Return the radius (mm) of a contour for (n,) in-plane angles (rad) about its centre."""
-    return contour_radii(np.ascontiguousarray(angles, dtype=np.float64), *contour_arrays(contour))
+    radii: FloatArray = contour_radii(np.ascontiguousarray(angles, dtype=np.float64), *contour_arrays(contour))
+    return radii

@@ -24,9 +24,9 @@ MAX_SCALE = 0.95
 MAX_DEPTH = 12
 
 
-def frozen(values: ArrayLike, dtype: type = np.float64) -> NDArray:
+def frozen(values: ArrayLike, dtype: type = np.float64) -> NDArray[Any]:
     """Return a read-only, C-contiguous copy of `values`."""
-    array = np.array(values, dtype=dtype, order="C", copy=True)
+    array: NDArray[Any] = np.array(values, dtype=dtype, order="C", copy=True)
     array.setflags(write=False)
     return array
 
@@ -284,7 +284,8 @@ def rotation_matrix(vector: ArrayLike) -> FloatArray:
         return np.eye(3)
     x, y, z = v / angle
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+    matrix: FloatArray = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+    return matrix
 
 
 class ErrorFigures(NamedTuple):
