@@ -202,13 +202,24 @@ def _on_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Outc
 
 
 def _one_process() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_one_thread)
+    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_begin_worker)
 
 
-def _one_thread() -> None:
-    """Keep a worker's libraries to one thread: the processes share the cores."""
+def _begin_worker() -> None:
+    """Keep a worker's libraries to one thread, as the processes share the cores; and end with the process that asks.
+
+    Without that a worker would wait for ever for a parent that was killed: it holds both ends of the queue itself.
+    """
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _on_dask(jobs: Sequence[Job], scheduler: str) -> Iterator[tuple[Job, Outcome]]:

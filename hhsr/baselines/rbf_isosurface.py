@@ -13,6 +13,8 @@ from hhsr.baselines.distances import mesh_error
 from hhsr.errors import FitError
 from hhsr.fitting.samples import area_samples
 from hhsr.model import FloatArray, IntArray
+from hhsr.read.quality import body_volumes
+from hhsr.read.topology import body_of_faces
 from hhsr.triangle_tree import TriangleTree
 
 SURFACE_SAMPLES = 3000
@@ -140,4 +142,12 @@ def _zero_set(centres: FloatArray, solution: FloatArray, power: int) -> tuple[Fl
             away = np.clip(_value(part, centres, solution, power) / np.sqrt(length), -step / 4, step / 4)
             moved.append(part - (away / np.sqrt(length))[:, None] * slope)
         points = np.concatenate(moved)
-    return points, found[1].astype(np.int64)
+    return _largest_body(points, found[1].astype(np.int64))
+
+
+def _largest_body(points: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
+    """Return the body of most volume: whoever decodes the function can drop the sheets that it invents far away."""
+    bodies = body_of_faces(faces)
+    kept = faces[bodies == int(np.argmax(np.abs(body_volumes(points, faces, bodies))))]
+    used = np.unique(kept)
+    return points[used], np.searchsorted(used, kept)
