@@ -10,20 +10,12 @@ import numba
 import numpy as np
 
 from hhsr.fitting.lookahead import Piece
-from hhsr.fitting.refine import (
-    Task,
-    figures,
-    hint_rows,
-    hold_rows,
-    improved,
-    mending_rows,
-    start_rows,
-    task_of,
-)
+from hhsr.fitting.refine import figures, improved, mending_rows
 from hhsr.fitting.rows import Rows
 from hhsr.fitting.scale_field import NONE, costs_of_dropping, fit_ellipsoid, grid_for, leaf_of, select_centres
 from hhsr.fitting.solid import Solid
 from hhsr.fitting.spend import counts_within
+from hhsr.fitting.task import Task, hint_rows, hold_rows, start_rows, task_of
 from hhsr.model import IntArray, ModelLeaf, ScaleField, frozen
 
 T = TypeVar("T")

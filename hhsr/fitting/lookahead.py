@@ -87,7 +87,8 @@ class Parting:
 
     def hidden(self, count: int) -> float:
         """Return the share of the samples that the centres of `count` pieces do not see."""
-        return sum(piece.hidden for piece in self._pieces[count - 1]) / self._solid.samples.points.shape[0]
+        unseen = sum(piece.hidden for piece in self._pieces[count - 1])
+        return unseen / len(self._solid.samples.points)
 
     def tree(self, leaves: Sequence[Node]) -> Node:
         """Return the tree of as many pieces as there are leaves, given in the order of `pieces`."""
@@ -136,7 +137,7 @@ class Parting:
 
 def _fall(piece: Piece, offer: Split | Literal["unknown"] | None) -> float:
     """Return by how much a split lowers a piece's misfit; −inf where there is none."""
-    return piece.misfit - offer.misfit if isinstance(offer, Split) else -np.inf
+    return float(piece.misfit - offer.misfit) if isinstance(offer, Split) else -np.inf
 
 
 def best_centre(solid: Solid, members: IntArray, region: Region, power: float) -> tuple[FloatArray, float, float]:

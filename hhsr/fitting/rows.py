@@ -5,8 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hhsr.model import FloatArray
+
+BoolArray = NDArray[np.bool_]
 
 GRAZING = 0.2
 
@@ -20,7 +23,7 @@ class Rows(NamedTuple):
     directions: FloatArray
     radii: FloatArray
     weights: FloatArray
-    bound: FloatArray
+    bound: BoolArray
 
     def joined(self, others: Rows) -> Rows:
         """Return these rows and others."""

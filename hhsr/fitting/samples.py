@@ -63,7 +63,8 @@ def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
         for axis in range(3):
             total[:, axis] += np.bincount(faces[:, corner], crosses[:, axis], vertices.shape[0])
     length = np.sqrt((total**2).sum(axis=1, keepdims=True))
-    return np.divide(total, length, out=np.zeros_like(total), where=length > 0.0)
+    normals: FloatArray = np.divide(total, length, out=np.zeros_like(total), where=length > 0.0)
+    return normals
 
 
 def turned_fibonacci(count: int, seed: int = 0) -> FloatArray:

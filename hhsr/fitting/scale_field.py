@@ -24,12 +24,12 @@ NONE = np.zeros(0, np.int64)
 class Selection(NamedTuple):
     """Centres of one leaf in the order in which they pay, the first `held` of them kept from before.
 
-    index: (k,) atoms of the grid. gains: (k,) fall of the rows' sum of squares, mm². triangle, right: see
+    atoms: (k,) indices into the grid. gains: (k,) fall of the rows' sum of squares, mm². triangle, right: see
     `hhsr.kernels.selection.orthogonal_selection`.
     """
 
     grid: CentreGrid
-    index: IntArray
+    atoms: IntArray
     gains: FloatArray
     triangle: FloatArray
     right: FloatArray
@@ -38,8 +38,8 @@ class Selection(NamedTuple):
     def field(self, count: int) -> ScaleField:
         """Return the scale field of the first `count` centres."""
         weights = back_substituted(self.triangle, self.right, count)
-        order = np.argsort(self.index[:count], kind="stable")
-        return ScaleField(self.grid, self.index[:count][order], weights[order])
+        order = np.argsort(self.atoms[:count], kind="stable")
+        return ScaleField(self.grid, self.atoms[:count][order], weights[order])
 
 
 def grid_for(finest: int) -> CentreGrid:
@@ -54,7 +54,8 @@ def dictionary(grid: CentreGrid, directions: FloatArray) -> tuple[IntArray, IntA
     """Return the compressed rows of λ over the whole grid, for (n, 3) unit directions."""
     starts = np.concatenate([[0], np.cumsum(grid.sizes)]).astype(np.int64)
     extents = grid.extents[starts[:-1]].copy()
-    return dictionary_rows(np.ascontiguousarray(directions), grid.centres, starts, extents)
+    pointer, index, value = dictionary_rows(np.ascontiguousarray(directions), grid.centres, starts, extents)
+    return pointer, index, value
 
 
 def ellipsoid_radii(half_axes: FloatArray, directions: FloatArray) -> FloatArray:
@@ -89,7 +90,8 @@ def fit_ellipsoid(rows: Rows, iterations: int = 12) -> FloatArray:
         normal = np.einsum("n,ni,nj->ij", weight, jacobian, jacobian) + ridge * np.eye(6)
         right = np.einsum("n,ni,n->i", weight, jacobian, miss) + ridge * (math.log(mean) - logs)
         logs = logs + np.clip(solve_normal(normal, right), -0.5, 0.5)
-    return np.exp(np.clip(logs, math.log(0.05 * mean), math.log(20.0 * mean)))
+    half_axes: FloatArray = np.exp(np.clip(logs, math.log(0.05 * mean), math.log(20.0 * mean)))
+    return half_axes
 
 
 def select_centres(rows: Rows, half_axes: FloatArray, grid: CentreGrid, count: int, held: IntArray = NONE) -> Selection:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hhsr.fitting.rows import BoolArray
 from hhsr.fitting.samples import Samples, area_samples, face_areas
 from hhsr.model import Cut, FloatArray, IntArray, Node
 from hhsr.triangle_tree import TriangleTree
@@ -17,7 +18,7 @@ class Region(NamedTuple):
     normals: FloatArray
     offsets: FloatArray
 
-    def holds(self, points: FloatArray) -> FloatArray:
+    def holds(self, points: FloatArray) -> BoolArray:
         """Return (n,) bool: which of (n, 3) points lie in the region."""
         inside = np.ones(points.shape[0], dtype=bool)
         for normal, offset in zip(self.normals, self.offsets, strict=True):

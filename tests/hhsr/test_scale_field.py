@@ -75,7 +75,7 @@ def test_greedy_choice_is_that_of_the_slow_way() -> None:
     a = dense_dictionary(grid, rows.directions) * (rows.weights * 20.0)[:, None]
     ridge = RIDGE * (a**2).sum(axis=0).mean()
     chosen, weights = slow_selection(a, rows.weights * (20.0 - rows.radii), 8, ridge)
-    assert selection.index.tolist() == chosen
+    assert selection.atoms.tolist() == chosen
     field = selection.field(8)
     assert np.allclose(field.weights, weights[np.argsort(chosen)], rtol=1e-4, atol=1e-6)
     assert (np.diff(field.index) > 0).all()
@@ -86,9 +86,9 @@ def test_held_centres_are_kept_and_come_first() -> None:
     grid = grid_for(300)
     held = np.array([5, 99, 17])
     selection = select_centres(rows, axes, grid, 20, held)
-    assert selection.index[:3].tolist() == held.tolist()
-    assert (selection.held, selection.index.size) == (3, 20)
-    assert len(set(selection.index.tolist())) == 20
+    assert selection.atoms[:3].tolist() == held.tolist()
+    assert (selection.held, selection.atoms.size) == (3, 20)
+    assert len(set(selection.atoms.tolist())) == 20
 
 
 @settings(max_examples=20, deadline=None)
@@ -97,7 +97,7 @@ def test_a_longer_choice_never_fits_worse(seed: int) -> None:
     rows, axes = bumpy_rows(900, seed)
     selection = select_centres(rows, axes, grid_for(120), 40)
     misses = []
-    for count in (1, 5, 20, selection.index.size):
+    for count in (1, 5, 20, selection.atoms.size):
         leaf = leaf_of(np.zeros(3), axes, selection.field(count))
         misses.append(float(((rows.weights * (leaf_radius(leaf, rows.directions) - rows.radii)) ** 2).sum()))
     assert (np.diff(misses) <= 1e-3 * misses[0]).all()
