@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -22,14 +23,14 @@ class Candidates:
     tips: Array
     inward: Array
 
-    @property
+    @cached_property
     def directions(self) -> Array:
         """Unit vectors (n, 3) from entry to tip; NaN where both are one point."""
         across = self.tips - self.entries
         length = np.linalg.norm(across, axis=1)
         return np.asarray(across / np.where(length > 0.0, length, np.nan)[:, None])
 
-    @property
+    @cached_property
     def depths(self) -> Array:
         """Inserted lengths (n,), mm."""
         return np.asarray(np.linalg.norm(self.tips - self.entries, axis=1))
