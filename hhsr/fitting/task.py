@@ -26,10 +26,11 @@ class Task(NamedTuple):
     """A leaf's task as seen from its centre.
 
     points, normals: (n, 3) its samples; seen: (n,) which of them the centre sees through the solid.
-    free: (r, 3) rays that meet the source within the region. behind: (b, 3) rays that leave the region inside the
-    solid: there the leaf is cut off, and has to reach the plane. bound: (b,) mm that ρ has to be at least: the plane
-    and some slack. urgency: (b,) by how much a miss counts more there: falling short by a hair opens a void as deep as the solid
-    is. hint: (b,) mm, where the ray leaves the solid beyond the plane, at most half as far again.
+    free: (r, 3) rays that meet the source within the region.
+    behind: (b, 3) rays that leave the region inside the solid: there the leaf is cut off, and has to reach the plane.
+    bound: (b,) mm that ρ has to be at least: the plane and some slack.
+    urgency: (b,) by how much a miss counts more: falling short by a hair opens a void as deep as the solid is there.
+    hint: (b,) mm, where the ray leaves the solid beyond the plane, at most half as far again.
     """
 
     region: Region
