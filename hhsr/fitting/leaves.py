@@ -21,19 +21,28 @@ from hhsr.model import IntArray, ModelLeaf, ScaleField, frozen
 T = TypeVar("T")
 
 LEAF_NUMBERS = 9
-ATOMS_PER_NUMBER = 7
-SCOUTS_ATOMS = 4
 FINEST = (60, 8_000)
-SWAPS = 3
+
+
+class Effort(NamedTuple):
+    """Centres of the finest grid for each number to spend, Gauss-Newton steps in a row, rounds of swaps at most."""
+
+    atoms: int
+    steps: int
+    swaps: int
+
+
+SCOUT = Effort(5, 2, 1)
+THOROUGH = Effort(7, 3, 3)
 SWAPPED = 0.3
-STEPS = 3
 POWER = 1.5
 SEED = 5
 
 
 class Fitted(NamedTuple):
-    """Leaves in the order of their pieces; mean and largest miss (mm); the share of samples that no centre sees; which
-    leaf has the largest miss.
+    """Leaves in the order of their pieces, and how they fit.
+
+    mean, largest: miss, mm. unseen: share of the samples that no centre sees. worst: the leaf with the largest miss.
     """
 
     leaves: list[ModelLeaf]
@@ -43,15 +52,15 @@ class Fitted(NamedTuple):
     worst: int
 
 
-def fit_leaves(solid: Solid, pieces: list[Piece], budget: int, thorough: bool) -> Fitted:
+def fit_leaves(solid: Solid, pieces: list[Piece], budget: int, effort: Effort) -> Fitted:
     """Return the leaves of the pieces within a budget of numbers.
 
-    thorough: also up to three rounds in which the centres worth least are swapped for better ones.
+    effort: a scout tells which parting is worth a thorough fit; without a round of swaps it tells the wrong one.
     """
     free = budget - LEAF_NUMBERS * len(pieces)
     if free < 0:
         raise ValueError(f"budget: got {budget} numbers for {len(pieces)} leaves, expected {LEAF_NUMBERS} for each")
-    grid = grid_for(int(np.clip((ATOMS_PER_NUMBER if thorough else SCOUTS_ATOMS) * budget / len(pieces), *FINEST)))
+    grid = grid_for(int(np.clip(effort.atoms * budget / len(pieces), *FINEST)))
     tasks = in_threads(
         lambda k: task_of(solid, pieces[k].region, pieces[k].members, pieces[k].centre, SEED), len(pieces)
     )
@@ -63,9 +72,9 @@ def fit_leaves(solid: Solid, pieces: list[Piece], budget: int, thorough: bool) -
     rows = [_first_rows(solid, t, leaf) for t, leaf in zip(tasks, bare, strict=True)]
     limits = [int(2.0 * free / len(pieces)) + 1] * len(pieces)
     leaves = _chosen(bare, rows, [NONE] * len(pieces), limits, free)
-    best = _judged(solid, tasks, _refined(solid, tasks, leaves, STEPS if thorough else 1))
-    for _ in range(SWAPS if thorough else 0):
-        swapped = _judged(solid, tasks, _refined(solid, tasks, _swapped(solid, tasks, best.leaves, free), STEPS))
+    best = _judged(solid, tasks, _refined(solid, tasks, leaves, effort.steps))
+    for _ in range(effort.swaps):
+        swapped = _judged(solid, tasks, _refined(solid, tasks, _swapped(solid, tasks, best.leaves, free), effort.steps))
         if swapped.mean >= best.mean:
             break
         best = swapped

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hhsr.errors import FitError
-from hhsr.fitting.leaves import LEAF_NUMBERS, Fitted, fit_leaves
+from hhsr.fitting.leaves import LEAF_NUMBERS, SCOUT, THOROUGH, Effort, Fitted, fit_leaves
 from hhsr.fitting.lookahead import Parting
 from hhsr.fitting.options import FitOptions
 from hhsr.fitting.quantise import quantised
@@ -81,7 +81,7 @@ def _spent(solid: Solid, parting: Parting, budget: int) -> tuple[Node, Fitted]:
     scouts = _scouts(solid, parting, budget)
     best = min(scouts, key=lambda choice: choice.score)
     parting, best = _mended(solid, parting, best, budget)
-    fitted = _fit(solid, parting, best.pieces, budget, thorough=True)
+    fitted = _fit(solid, parting, best.pieces, budget, THOROUGH)
     return parting.tree(fitted.leaves), fitted
 
 
@@ -91,7 +91,7 @@ def _mended(solid: Solid, parting: Parting, best: Choice, budget: int) -> tuple[
         cut = parting.with_cut(best.pieces, best.fitted.worst)
         if cut is None:
             break
-        tried = Choice(best.pieces + 1, _fit(solid, cut, best.pieces + 1, budget, thorough=False))
+        tried = Choice(best.pieces + 1, _fit(solid, cut, best.pieces + 1, budget, SCOUT))
         if tried.score >= best.score:
             break
         parting, best = cut, tried
@@ -107,7 +107,7 @@ def _scouts(solid: Solid, parting: Parting, budget: int) -> list[Choice]:
             break
         if count < most and _hopeless(parting, count):
             continue
-        found.append(Choice(count, _fit(solid, parting, count, budget, thorough=False)))
+        found.append(Choice(count, _fit(solid, parting, count, budget, SCOUT)))
         best = min(found, key=lambda choice: choice.score)
         last = found[-1]
         if last.pieces - best.pieces >= PATIENCE or last.score > 1.5 * best.score:
@@ -126,7 +126,7 @@ def _hopeless(parting: Parting, count: int) -> bool:
     )
 
 
-def _fit(solid: Solid, parting: Parting, pieces: int, budget: int, thorough: bool) -> Fitted:
+def _fit(solid: Solid, parting: Parting, pieces: int, budget: int, effort: Effort) -> Fitted:
     """Return the fitted leaves of so many pieces."""
     numbers = budget - POSE_NUMBERS - CUT_NUMBERS * (pieces - 1)
-    return fit_leaves(solid, parting.pieces(pieces), numbers, thorough)
+    return fit_leaves(solid, parting.pieces(pieces), numbers, effort)

