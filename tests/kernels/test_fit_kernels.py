@@ -1,0 +1,198 @@
+"""The least-squares kernels of the fit against numpy on systems of a few rows."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from hhsr.kernels import field_rows, lookahead, refinement, selection
+from hhsr.kernels.sphere_rbf import wendland_gaussian
+from hhsr.model import CentreGrid
+
+GRID = CentreGrid((12, 40), 2.0)
+LEVELS = np.array([0, 12, 52])
+LEVEL_EXTENTS = GRID.extents[[0, 12]]
+
+
+def directions(count: int, seed: int = 0) -> np.ndarray:
+    u = np.random.default_rng(seed).normal(size=(count, 3))
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    u[:2] = [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]
+    return u
+
+
+def dense_rows(u: np.ndarray, centres: np.ndarray, extents: np.ndarray) -> np.ndarray:
+    """Return (n, k) λ of every direction and centre."""
+    h = (1.0 - u @ centres.T) / extents
+    return np.where(h < 1.0, np.exp(-4.0 * h) * (1.0 - h) ** 2, 0.0)
+
+
+def dense_of(pointer: np.ndarray, index: np.ndarray, value: np.ndarray, columns: int) -> np.ndarray:
+    out = np.zeros((len(pointer) - 1, columns))
+    for i in range(len(out)):
+        np.add.at(out[i], index[pointer[i] : pointer[i + 1]], value[pointer[i] : pointer[i + 1]])
+    return out
+
+
+def test_three_ways_to_the_same_rows() -> None:
+    u = directions(25)
+    expected = dense_rows(u, GRID.centres, GRID.extents)
+    found = selection.dictionary_rows(u, GRID.centres, LEVELS, LEVEL_EXTENTS)
+    np.testing.assert_allclose(dense_of(*found, GRID.size), expected, atol=1e-12)
+    found = field_rows.sparse_rows(u, GRID.centres, 1.0 / GRID.extents)
+    np.testing.assert_allclose(dense_of(*found, GRID.size), expected, atol=1e-12)
+    found = refinement.chosen_rows(u, GRID.centres, GRID.extents)
+    np.testing.assert_allclose(dense_of(*found, GRID.size), expected, atol=1e-12)
+    weights = np.random.default_rng(1).normal(size=GRID.size)
+    np.testing.assert_allclose(field_rows.row_products(*found, weights), expected @ weights, atol=1e-12)
+    np.testing.assert_allclose(refinement.field_values(*found, weights), expected @ weights, atol=1e-12)
+    squares = field_rows.column_squares(*found, GRID.size)
+    np.testing.assert_allclose(squares, (expected**2).sum(axis=0), atol=1e-12)
+
+
+def test_rows_grow_beyond_the_first_room() -> None:
+    u = directions(3)
+    wide = CentreGrid((200,), 40.0)  # every support is the whole sphere
+    expected = dense_rows(u, wide.centres, wide.extents)
+    found = selection.dictionary_rows(u, wide.centres, np.array([0, 200]), wide.extents[:1])
+    assert len(found[2]) > 64 * len(u)
+    np.testing.assert_allclose(dense_of(*found, 200), expected, atol=1e-12)
+    found = field_rows.sparse_rows(u, wide.centres, 1.0 / wide.extents)
+    np.testing.assert_allclose(dense_of(*found, 200), expected, atol=1e-12)
+
+
+def test_columns_are_the_transposed_rows() -> None:
+    found = selection.dictionary_rows(directions(9), GRID.centres, LEVELS, LEVEL_EXTENTS)
+    columns = selection.transposed(*found, GRID.size)
+    np.testing.assert_array_equal(dense_of(*columns, 9).T, dense_of(*found, GRID.size))
+
+
+def test_normal_equations_are_those_of_numpy() -> None:
+    rng = np.random.default_rng(2)
+    rows = refinement.chosen_rows(directions(20), GRID.centres[:12], GRID.extents[:12])
+    a = dense_of(*rows, 12)
+    weight, target, slope, dense = rng.random(20), rng.normal(size=20), rng.normal(size=20), rng.normal(size=(20, 3))
+    weight[::4] = 0.0
+    gram, right = np.zeros((12, 12)), np.zeros(12)
+    field_rows.add_normal_equations(*rows, weight, target, gram, right)
+    np.testing.assert_allclose(gram, a.T @ (weight[:, None] * a), atol=1e-12)
+    np.testing.assert_allclose(right, a.T @ (weight * target), atol=1e-12)
+    jacobian = np.concatenate([slope[:, None] * a, dense], axis=1)
+    matrix, right = refinement.normal_equations(*rows, slope, dense, target, weight, 12)
+    np.testing.assert_allclose(matrix, jacobian.T @ (weight[:, None] * jacobian), atol=1e-12)
+    np.testing.assert_allclose(right, -jacobian.T @ (weight * target), atol=1e-12)
+
+
+def test_solving_and_dropping_are_those_of_numpy() -> None:
+    rng = np.random.default_rng(3)
+    a = rng.normal(size=(12, 5))
+    matrix, right = a.T @ a, rng.normal(size=5)
+    np.testing.assert_allclose(selection.solve_normal(matrix, right), np.linalg.solve(matrix, right), rtol=1e-9)
+    triangle = np.linalg.cholesky(matrix)
+    y = np.linalg.solve(triangle, right)
+    np.testing.assert_allclose(
+        selection.back_substituted(triangle, y, 3), np.linalg.solve(triangle[:3, :3].T, y[:3]), rtol=1e-9
+    )
+    # What a dropped unknown costs, by solving again without it: the form wᵀGw − 2 rᵀw, less its least value.
+    full = -right @ np.linalg.solve(matrix, right)
+    costs = []
+    for k in range(5):
+        keep = np.delete(np.arange(5), k)
+        costs.append(-right[keep] @ np.linalg.solve(matrix[np.ix_(keep, keep)], right[keep]) - full)
+    np.testing.assert_allclose(selection.drop_costs(triangle, y), costs, rtol=1e-7)
+
+
+def greedy(a: np.ndarray, target: np.ndarray, count: int, ridge: float) -> list[int]:
+    """Return the atoms of a forward selection that solves every candidate system afresh."""
+
+    def least(columns: list[int]) -> float:
+        g = a[:, columns].T @ a[:, columns] + ridge * np.eye(len(columns))
+        r = a[:, columns].T @ target
+        return float(-r @ np.linalg.solve(g, r))
+
+    chosen: list[int] = []
+    for _ in range(count):
+        free = [j for j in range(a.shape[1]) if j not in chosen and (a[:, j] ** 2).sum() > 0]
+        chosen.append(min(free, key=lambda j: least([*chosen, j])))
+    return chosen
+
+
+def test_selection_is_the_greedy_one_and_its_weights_solve_the_ridge_problem() -> None:
+    rng = np.random.default_rng(4)
+    rows = selection.dictionary_rows(directions(60), GRID.centres, LEVELS, LEVEL_EXTENTS)
+    scale, target = rng.uniform(0.5, 2.0, 60), rng.normal(size=60)
+    a = scale[:, None] * dense_of(*rows, GRID.size)
+    seen = (a**2).sum(axis=0)
+    floor = 1e-2 * seen.sum() / (seen > 0).sum()
+    none = np.zeros(0, np.int64)
+    chosen, gains, triangle, right = selection.orthogonal_selection(*rows, scale, target, GRID.size, 6, 1e-2, none)
+    assert chosen.tolist() == greedy(a, target, 6, floor)
+    gram = a[:, chosen].T @ a[:, chosen] + floor * np.eye(6)
+    np.testing.assert_allclose(triangle @ triangle.T, gram, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(triangle @ right, a[:, chosen].T @ target, rtol=1e-4, atol=1e-4)
+    pull = a[:, chosen].T @ target
+    assert gains.sum() == pytest.approx(pull @ np.linalg.solve(gram, pull), rel=1e-4)
+    held = np.array([chosen[3], chosen[1]])
+    again = selection.orthogonal_selection(*rows, scale, target, GRID.size, 4, 1e-2, held)[0]
+    assert again[:2].tolist() == held.tolist()
+    assert len(set(again.tolist())) == 4
+
+
+def test_selection_ends_where_nothing_is_left_to_gain() -> None:
+    rows = selection.dictionary_rows(directions(5), GRID.centres, LEVELS, LEVEL_EXTENTS)
+    none = np.zeros(0, np.int64)
+    nothing = selection.orthogonal_selection(*rows, np.ones(5), np.zeros(5), GRID.size, 10, 1e-3, none)
+    assert [len(part) for part in nothing] == [0, 0, 0, 0]
+    one = (np.array([0, 1, 2]), np.array([0, 0], np.int32), np.array([1.0, 2.0]))  # two rows see one atom of three
+    chosen, gains, _, right = selection.orthogonal_selection(*one, np.ones(2), np.array([1.0, 2.0]), 3, 3, 0.0, none)
+    assert chosen.tolist() == [0]
+    assert gains[0] == pytest.approx(5.0)
+    assert right[0] == pytest.approx(math.sqrt(5.0))
+
+
+def sphere_samples(centre: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    normals = CentreGrid((600,), 2.0).centres
+    return centre + radius * normals, np.array(normals)
+
+
+def test_a_sphere_is_told_best_from_its_centre() -> None:
+    centre = np.array([1.0, -2.0, 0.5])
+    points, normals = sphere_samples(centre, 10.0)
+    order = np.arange(600)
+    candidates = centre + np.array([[0.0, 0, 0], [4.0, 0, 0], [0, -6.0, 0]])
+    out = lookahead.misfits(points, normals, order, np.zeros((3, 600)), candidates, 2.0)
+    assert out[0] < 1e-6
+    assert out[0] < out[1] < out[2]
+    # A member that the centre does not see costs its gap and is not fitted.
+    gaps = np.zeros((3, 600))
+    gaps[0, 5] = 7.0
+    hidden = lookahead.misfits(points, normals, order, gaps, candidates, 2.0)
+    assert hidden[0] == pytest.approx(7.0, abs=1e-6)
+    assert hidden[1:].tolist() == out[1:].tolist()
+
+
+def test_a_cut_between_two_spheres_finds_both_centres() -> None:
+    middles = np.array([[-15.0, 0, 0], [15.0, 0, 0]])
+    both = [sphere_samples(m, 8.0) for m in middles]
+    points, normals = np.concatenate([b[0] for b in both]), np.concatenate([b[1] for b in both])
+    order = np.arange(1200)
+    candidates = np.concatenate([middles + np.array([0.0, 3.0, 0.0]), middles])
+    along = np.array([[1.0, 0, 0], [0, 1.0, 0]])
+    misfit, which = lookahead.best_centres(
+        points, normals, order, np.zeros((4, 1200)), along @ points.T, np.array([[0.0, 40.0], [0.0, 40.0]]),
+        candidates, along @ candidates.T, 2.0,
+    )  # fmt: skip
+    assert which[0, 0].tolist() == [2, 3]  # the middles themselves, left and right of x = 0
+    assert (misfit[0, 0] < 1e-6).all()
+    assert which[:, 1, 1].tolist() == [-1, -1]  # no candidate lies beyond 40 mm
+    assert np.isinf(misfit[:, 1, 1]).all()
+    assert (misfit[:, 1, 0] > 1.0).all()  # one centre for both spheres
+
+
+def test_gaussian_of_the_rows_is_the_leaf_one() -> None:
+    u = directions(4)
+    _, _, value = refinement.chosen_rows(u, u[3:], np.array([2.5]))
+    expected = [wendland_gaussian((1 - v @ u[3]) / 2.5) for v in u if 1 - v @ u[3] < 2.5]
+    np.testing.assert_allclose(value, expected, rtol=1e-12)
