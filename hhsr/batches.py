@@ -1,4 +1,4 @@
-"""Batches in parts: kernels release the interpreter's lock, so threads share a batch without a parallel kernel's start-up."""
+"""Batches in parts: kernels release the interpreter's lock, so threads share a batch at no cost to single calls."""
 
 from __future__ import annotations
 

@@ -60,6 +60,14 @@ class Clearance(NamedTuple):
     on_surface: FloatArray
 
 
+class Profile(NamedTuple):
+    """What lies along segments. t: (n,) shares. distance: (..., n) signed, mm. inside_mm: (...) length inside."""
+
+    t: FloatArray
+    distance: FloatArray
+    inside_mm: Any
+
+
 class Shape:
     """A fitted shape: a tree of small records, and every question about the solid that it means (DESIGN §2).
 
@@ -116,7 +124,7 @@ class Shape:
 
     @property
     def fit_error(self) -> ErrorFigures | None:
-        """Two-sided true distance to the source, mm: mean, 95th percentile, sampled maximum; None where not measured."""
+        """Two-sided true distance to the source, mm: mean, 95th percentile, sampled maximum; None: not measured."""
         return self.provenance.fit_error
 
     @property
@@ -197,7 +205,7 @@ class Shape:
     def closest_point(
         self, points: ArrayLike, on_invalid: OnInvalid = "raise", tolerance_mm: float = TOLERANCE_MM
     ) -> tuple[FloatArray, Any]:
-        """Return (..., 3) a surface point nearest to points (..., 3), to the tolerance, and (...) signed distance mm."""
+        """Return (..., 3) a surface point nearest to points (..., 3), to the tolerance, and (...) signed distance."""
         return self._nearest(points, on_invalid, tolerance_mm)
 
     def _nearest(self, points: ArrayLike, on_invalid: OnInvalid, tolerance_mm: float) -> tuple[FloatArray, Any]:
@@ -232,7 +240,7 @@ class Shape:
         Nothing thicker than the resolution is missed; places are right to the tolerance. Between two outside points the
         number is even. A segment of no length has no crossings.
         """
-        first, last, _ = _segments(starts, ends)
+        first, last, _ = broadcast_segments(starts, ends)
         resolution = as_float(resolution_mm, "resolution_mm", 1e-6, 1e3)
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-9, 1e3)
         counts, begins = np.empty(len(first), dtype=np.int64), np.empty(len(first), dtype=np.bool_)
@@ -279,7 +287,7 @@ class Shape:
 
         With on_invalid="mark": (t, valid), valid (...) False where a segment is not finite.
         """
-        first, last, shape = _segments(starts, ends)
+        first, last, shape = broadcast_segments(starts, ends)
         mark = _marks(on_invalid)
         resolution = as_float(resolution_mm, "resolution_mm", 1e-6, 1e3)
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-9, 1e3)
@@ -309,7 +317,7 @@ class Shape:
         on_invalid: OnInvalid = "raise",
         tolerance_mm: float = TOLERANCE_MM,
     ) -> Any:
-        """Return (...) mm between capsules (segments (..., 3) → (..., 3) of a radius) and the solid, < 0 where they touch.
+        """Return (...) mm between capsules (segments (..., 3) → (..., 3)) and the solid, < 0 where they touch.
 
         min over the segment of signed_distance − radius: −(greatest depth) − radius where the axis enters. Never above
         the truth, at most the tolerance below it. NaN where not finite, with on_invalid="mark".
@@ -325,7 +333,7 @@ class Shape:
         tolerance_mm: float = TOLERANCE_MM,
     ) -> Clearance:
         """Return `clearance` with the closest pair of points and where along the segment it lies."""
-        first, last, shape = _segments(starts, ends)
+        first, last, shape = broadcast_segments(starts, ends)
         mark = _marks(on_invalid)
         thick = as_float(radius, "radius", 0.0)
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-4, 1e3)
@@ -351,6 +359,34 @@ class Shape:
             foot.reshape(*shape, 3),
         )
 
+    def profile(self, starts: ArrayLike, ends: ArrayLike, n: int = 65) -> Profile:
+        """Return signed distance at `n` ≥ 2 even steps along segments (..., 3) → (..., 3), and the length inside."""
+        first, last, shape = broadcast_segments(starts, ends)
+        if n < 2:
+            raise InputError(f"n: got {n}, expected at least 2 steps: both ends")
+        t = np.linspace(0.0, 1.0, n)
+        found = self.crossings(first, last)
+        points = first[:, None] + t[:, None] * (last - first)[:, None]
+        distance = np.asarray(self.signed_distance(points)).reshape(*shape, n)
+        # Entering at t adds 1 − t to what lies inside, leaving takes 1 − t off again; an inside start adds 1.
+        rest = np.where(found.entering, 1.0 - found.t, found.t - 1.0)
+        row = np.repeat(np.arange(len(first)), np.diff(found.offsets))
+        share = np.bincount(row, weights=rest, minlength=len(first)) + np.asarray(self.contains(first), dtype=float)
+        length = np.sqrt(((last - first) ** 2).sum(axis=1))
+        return Profile(t, distance, _scalar((share * length).reshape(shape)))
+
+    # -- a curved needle ----------------------------------------------------------------------------------------------
+
+    def polyline_crossings(self, points: ArrayLike) -> Crossings:
+        """Return the crossings of a curve (k, 3), k ≥ 2: offsets and t of its k − 1 segments, in order along it."""
+        curve = _curve(points)
+        return self.crossings(curve[:-1], curve[1:])
+
+    def polyline_clearance(self, points: ArrayLike, radius: float = 0.0) -> float:
+        """Return mm between a curve (k, 3) of a radius and the solid, as `clearance`: the least of its segments."""
+        curve = _curve(points)
+        return float(np.min(self.clearance(curve[:-1], curve[1:], radius)))
+
 
 def load(path: str | Path) -> Shape:
     """Return the shape in a .hhsr file; raise FileFormatError where it is none, or damaged."""
@@ -359,6 +395,13 @@ def load(path: str | Path) -> Shape:
     except OSError as error:
         raise FileFormatError(f"{path}: cannot be read ({error.strerror}), expected a .hhsr file") from error
     return Shape(*io.decode(content))
+
+
+def _curve(points: ArrayLike) -> FloatArray:
+    curve = as_points(points)
+    if curve.ndim != 2 or len(curve) < 2:
+        raise InputError(f"points: got shape {curve.shape}, expected (k, 3) with k ≥ 2 points along a curve")
+    return curve
 
 
 def _marks(on_invalid: str) -> bool:
@@ -372,7 +415,8 @@ def _scalar(array: NDArray[Any]) -> Any:
     return array.item() if array.ndim == 0 else array
 
 
-def _segments(starts: ArrayLike, ends: ArrayLike) -> tuple[FloatArray, FloatArray, tuple[int, ...]]:
+def broadcast_segments(starts: ArrayLike, ends: ArrayLike) -> tuple[FloatArray, FloatArray, tuple[int, ...]]:
+    """Return starts and ends as (n, 3), and the shape (...) of the answer; one start may serve many ends."""
     first, last = as_points(starts, "starts"), as_points(ends, "ends")
     if first.shape != last.shape:
         try:
@@ -385,4 +429,4 @@ def _segments(starts: ArrayLike, ends: ArrayLike) -> tuple[FloatArray, FloatArra
     return first.reshape(-1, 3), last.reshape(-1, 3), first.shape[:-1]
 
 
-__all__ = ["Clearance", "Crossings", "Shape", "load"]
+__all__ = ["Clearance", "Crossings", "Profile", "Shape", "load"]

@@ -15,7 +15,6 @@ from hhsr.kernels.layout import (
     AZIMUTH_COUNT,
     BLOCKS,
     BLOCKS_PER_SIDE,
-    CENTRE_COUNT,
     CENTRE_SIZE,
     CENTRES,
     ELEVATION,
@@ -26,8 +25,10 @@ from hhsr.kernels.leaf import MAX_SCALE
 from hhsr.kernels.norm_bounds import norm_range
 from hhsr.kernels.superquadric import superquadric_norm
 
+BORDER = math.exp(-4.0)
 
-@njit(cache=True)
+
+@njit(cache=True, error_model="numpy")
 def face_of(x, y, z):
     """Return (face, a, b, m) of a point that is not the centre: face 2k for the positive major axis k, 2k + 1 else."""
     ux, uy, uz = abs(x), abs(y), abs(z)
@@ -38,7 +39,7 @@ def face_of(x, y, z):
     return (4 if z >= 0.0 else 5), x / uz, y / uz, uz
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def direction_of(face, a, b):
     """Return the direction (x, y, z), of |·|∞ = 1, that belongs to (a, b) on a face."""
     m = 1.0 if face % 2 == 0 else -1.0
@@ -49,7 +50,7 @@ def direction_of(face, a, b):
     return a, b, m
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def chart_of(face, x, y, z):
     """Return (a, b, m) of a point on a given face: minor coordinates over the major one, and the major one."""
     if face < 2:
@@ -62,7 +63,7 @@ def chart_of(face, x, y, z):
     return x / m, y / m, m
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def block_of(face, a, b):
     """Return the index of the block of directions that holds (a, b)."""
     half = 0.5 * BLOCKS_PER_SIDE
@@ -71,7 +72,7 @@ def block_of(face, a, b):
     return (face * BLOCKS_PER_SIDE + i) * BLOCKS_PER_SIDE + j
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def scale_in_block(blob, ints, leaf, block, ux, uy, uz):
     """Return s(u), summed over the centres of the block in the order of the record: the same float as over all."""
     total = 0.0
@@ -86,7 +87,7 @@ def scale_in_block(blob, ints, leaf, block, ux, uy, uz):
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def norm_at(blob, ints, leaf, x, y, z):
     """Return the superquadric's norm N of a leaf at (x, y, z)."""
     n, m = ints[leaf + AZIMUTH_COUNT], ints[leaf + ELEVATION_COUNT]
@@ -101,7 +102,7 @@ def norm_at(blob, ints, leaf, x, y, z):
     )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def leaf_implicit(blob, ints, leaf, x, y, z):
     """Return G(p) = N(p) + s(p/|p|) − 1 in the leaf's frame: ≤ 0 inside. The exact formula behind every answer."""
     length = math.sqrt(x * x + y * y + z * z)
@@ -112,7 +113,7 @@ def leaf_implicit(blob, ints, leaf, x, y, z):
     return norm_at(blob, ints, leaf, x, y, z) + min(s, MAX_SCALE) - 1.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def inverse_radius(blob, ints, leaf, face, a, b):
     """Return W(a, b) by the exact formula."""
     x, y, z = direction_of(face, a, b)
@@ -121,14 +122,17 @@ def inverse_radius(blob, ints, leaf, face, a, b):
     return norm_at(blob, ints, leaf, x, y, z) / (1.0 - min(s, MAX_SCALE))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def scale_range(blob, ints, leaf, block, face, a, b, half_a, half_b):
-    """Return (s, s_a_lo, s_a_hi, s_b_lo, s_b_hi): s at the centre of a rectangle and its gradient's range over it.
+    """Return (s, s_a, s_b, wide_a, wide_b, s_aa, s_ab, s_bb, wide_h) of the scale field over a rectangle.
+
+    Values at its centre; over it the gradient stays within ± wide_a, ± wide_b, each second derivative within ± wide_h.
 
     Value, gradient and Hessian at the centre; the rest of the gradient is at most r²/2 times the third derivative
-    along any line of the chart, or r times the second where the rectangle touches the border of a support, at which
-    the second derivative jumps. A chart line is a great circle run at speeds α' ≤ 1/L, |α''| ≤ 1/L², |α'''| ≤ 2/L³
-    (L the least |dir|), and the derivatives of λ fall with h: all bounds are closed forms at the nearest point.
+    along any line of the chart, and r times the second of supports that the rectangle only touches; at the border of
+    a support the second derivative jumps by no more than 2 e⁻⁴ times its scale. A chart line is a great circle run
+    at speeds α′ ≤ 1/L, |α″| ≤ 1/L², |α‴| ≤ 2/L³ (L the least |dir|). The derivatives of λ fall with h, so that all
+    bounds are closed forms at the nearest point.
     """
     x, y, z = direction_of(face, a, b)
     length = math.sqrt(x * x + y * y + z * z)
@@ -154,21 +158,34 @@ def scale_range(blob, ints, leaf, block, face, a, b, half_a, half_b):
         if h_lo >= 1.0:
             continue
         bottom = tau * cos_delta - sine * sin_delta if tau > -cos_delta else -1.0
-        inside = (1.0 - bottom) * inverse < 1.0
+        h = (1.0 - tau) * inverse
+        beyond = (1.0 - bottom) * inverse - 1.0  # how far past the border of the support the rectangle reaches
+        inside = h < 1.0 and beyond <= 1.0
         far = min(sine + delta, 1.0)
-        t1 = far * speed
-        t2 = (1.0 + far) * speed * speed
         k = 1.0 - h_lo
         e = math.exp(-4.0 * h_lo)
-        d1 = e * k * (4.0 * k + 2.0)
-        d2 = e * (16.0 * k * k + 16.0 * k + 2.0)
+        d1 = inverse * e * k * (4.0 * k + 2.0)
+        d2 = inverse * inverse * e * (16.0 * k * k + 16.0 * k + 2.0)
+        # Along a great circle τ″ = −τ: with λ as a function of τ, its second derivative is λ″ τ′² − λ′ τ and its third
+        # τ′ (λ‴ τ′² − 3 λ″ τ − λ′), all λ's positive, 0 ≤ τ′² ≤ sin²: terms of opposite sign do not add up.
         if inside:
-            t3 = 3.0 * (far + 1.0) * speed * speed * speed
-            d3 = e * (64.0 * k * k + 96.0 * k + 24.0)
-            rest3 += abs(w) * inverse * (d3 * inverse * inverse * t1 * t1 * t1 + 3.0 * d2 * inverse * t1 * t2 + d1 * t3)
+            if beyond > 0.0:
+                d1 += 0.0022 * inverse  # the greatest |dλ/dh| of the continuation past the border
+            d3 = inverse * inverse * inverse * e * (64.0 * k * k + 96.0 * k + 24.0)
+            low = 0.0
+            if beyond <= 0.0 and bottom > 0.0:
+                k = -beyond
+                e = math.exp(-4.0 * (1.0 - k))
+                low = bottom * 3.0 * inverse * inverse * e * (16.0 * k * k + 16.0 * k + 2.0)
+            elif beyond > 0.0:
+                low = -6.0 * inverse * inverse * BORDER - 0.0022 * inverse
+            third = far * max(d3 * far * far - low, 3.0 * d2 + d1)
+            second = max(d2 * far * far, d1) + (2.0 * BORDER * inverse * inverse * far * far if beyond > 0.0 else 0.0)
+            rest3 += abs(w) * (third + 3.0 * second + 2.0 * d1 * far)
+            if beyond > 0.0:  # past the border λ is 0, not its own continuation, whose derivatives are small there
+                rest2 += abs(w) * inverse * 2.0 * BORDER * (inverse * far * far + 2.0 * beyond)
         else:
-            rest2 += abs(w) * inverse * (d2 * inverse * t1 * t1 + d1 * t2)
-        h = (1.0 - tau) * inverse
+            rest2 += abs(w) * (max(d2 * far * far, d1) + d1 * far)
         if h < 1.0:
             if face < 2:
                 ca, cb = cy, cz
@@ -190,26 +207,53 @@ def scale_range(blob, ints, leaf, block, face, a, b, half_a, half_b):
                 haa += second * ta * ta + first * ((-2.0 * ca * a - dot) * q3 + 3.0 * dot * a * a * q3 * q1 * q1)
                 hbb += second * tb * tb + first * ((-2.0 * cb * b - dot) * q3 + 3.0 * dot * b * b * q3 * q1 * q1)
                 hab += second * ta * tb + first * ((-ca * b - cb * a) * q3 + 3.0 * dot * a * b * q3 * q1 * q1)
+    rest2 *= speed * speed
+    rest3 *= speed * speed * speed
     rest = 0.5 * r * r * rest3 + r * rest2
     wide_a = abs(haa) * half_a + abs(hab) * half_b + rest
     wide_b = abs(hab) * half_a + abs(hbb) * half_b + rest
-    return value, ga - wide_a, ga + wide_a, gb - wide_b, gb + wide_b
+    return value, ga, gb, wide_a, wide_b, haa, hab, hbb, r * rest3 + rest2
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
+def axis_scale(blob, half_axes, axis, sign):
+    """Return 1/A² of the half axis on one side."""
+    size = blob[half_axes + axis] if sign > 0.0 else blob[half_axes + axis + 1]
+    return 1.0 / (size * size)
+
+
+@njit(cache=True, error_model="numpy")
+def _second(scale, ni_lo, ni_hi, nj_lo, nj_hi, n_lo, n_hi, d_lo, d_hi, si_lo, si_hi, sj_lo, sj_hi, ss_lo, ss_hi):
+    """Return the range of D N_ij + D² (N_i s_j + N_j s_i + N s_ij) + 2 D³ N s_i s_j, N_ij = (scale − N_i N_j)/N."""
+    lo, hi = product(ni_lo, ni_hi, nj_lo, nj_hi)
+    lo, hi = product(scale - hi, scale - lo, d_lo / n_hi, d_hi / n_lo)
+    p0, p1 = product(ni_lo, ni_hi, sj_lo, sj_hi)
+    q0, q1 = product(nj_lo, nj_hi, si_lo, si_hi)
+    r0, r1 = product(n_lo, n_hi, ss_lo, ss_hi)
+    a0, a1 = product(p0 + q0 + r0, p1 + q1 + r1, d_lo * d_lo, d_hi * d_hi)
+    b0, b1 = product(si_lo, si_hi, sj_lo, sj_hi)
+    b0, b1 = product(b0, b1, 2.0 * n_lo * d_lo * d_lo * d_lo, 2.0 * n_hi * d_hi * d_hi * d_hi)
+    return lo + a0 + b0, hi + a1 + b1
+
+
+@njit(cache=True, error_model="numpy")
 def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
     """Return (value, slope_a, slope_b, error, spread_a, spread_b, lo, hi) of W over a rectangle about (a, b).
 
-    |W − value − slope·δ| ≤ error, |∂W − slope| ≤ spread and lo ≤ W ≤ hi hold on the whole rectangle, proven. The
+    |W − value − slope·δ| ≤ error, |∂W − slope| ≤ spread and lo ≤ W ≤ hi hold on the whole rectangle, proven; `value` is
+    the middle of that strip, not W at the centre. The
     rectangle must lie within one block of directions and straddle no coordinate plane.
     """
     block = block_of(face, a, b)
-    s, sa_lo, sa_hi, sb_lo, sb_hi = scale_range(blob, ints, leaf, block, face, a, b, half_a, half_b)
+    s, sa, sb, wide_a, wide_b, saa, sab, sbb, wide_h = scale_range(blob, ints, leaf, block, face, a, b, half_a, half_b)
+    sa_lo, sa_hi, sb_lo, sb_hi = sa - wide_a, sa + wide_a, sb - wide_b, sb + wide_b
     x, y, z = direction_of(face, a, b)
     norm = norm_at(blob, ints, leaf, x, y, z)
     value = norm / (1.0 - min(s, MAX_SCALE))
     reach = max(-sa_lo, sa_hi) * half_a + max(-sb_lo, sb_hi) * half_b
     s_lo, s_hi = s - reach, s + reach
+    h, p, q = ints[leaf + HALF_AXES], ints[leaf + AZIMUTH_COUNT], ints[leaf + ELEVATION_COUNT]
+    smooth = p == 0 and q == 0 and s_hi < MAX_SCALE
     if s_hi > MAX_SCALE:  # the cap: slope 0 above it
         if s_lo > MAX_SCALE:
             sa_lo = sa_hi = sb_lo = sb_hi = 0.0
@@ -220,7 +264,6 @@ def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
     a0, a1 = max(abs(a) - half_a, 0.0), abs(a) + half_a
     b0, b1 = max(abs(b) - half_b, 0.0), abs(b) + half_b
     m = 1.0 if face % 2 == 0 else -1.0
-    h, p, q = ints[leaf + HALF_AXES], ints[leaf + AZIMUTH_COUNT], ints[leaf + ELEVATION_COUNT]
     axes = blob[h : h + 6]
     o = ints[leaf + AZIMUTH]
     azimuth = blob[o : o + 4 * p].reshape(p, 4)
@@ -256,4 +299,36 @@ def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
     slope_a, slope_b = 0.5 * (wa_lo + wa_hi), 0.5 * (wb_lo + wb_hi)
     spread_a, spread_b = 0.5 * (wa_hi - wa_lo), 0.5 * (wb_hi - wb_lo)
     error = (spread_a * half_a + spread_b * half_b) * (1.0 + 1e-11) + 1e-11 * abs(value)
+    if smooth:
+        # An ellipsoid: N_ij = (A_i² δ_ij − N_i N_j)/N, and Taylor to second order, with D_i = D² s_i.
+        if face < 2:
+            scale_a, scale_b = axis_scale(blob, h, 2, sign_a), axis_scale(blob, h, 4, sign_b)
+        elif face < 4:
+            scale_a, scale_b = axis_scale(blob, h, 4, sign_a), axis_scale(blob, h, 0, sign_b)
+        else:
+            scale_a, scale_b = axis_scale(blob, h, 0, sign_a), axis_scale(blob, h, 2, sign_b)
+        d = 1.0 / (1.0 - s)
+        exact_a = d * (scale_a * a / norm + value * sa)
+        exact_b = d * (scale_b * b / norm + value * sb)
+        aa_lo, aa_hi = _second(scale_a, na_lo, na_hi, na_lo, na_hi, n_lo, n_hi, d_lo, d_hi,
+                               sa_lo, sa_hi, sa_lo, sa_hi, saa - wide_h, saa + wide_h)  # fmt: skip
+        ab_lo, ab_hi = _second(0.0, na_lo, na_hi, nb_lo, nb_hi, n_lo, n_hi, d_lo, d_hi,
+                               sa_lo, sa_hi, sb_lo, sb_hi, sab - wide_h, sab + wide_h)  # fmt: skip
+        bb_lo, bb_hi = _second(scale_b, nb_lo, nb_hi, nb_lo, nb_hi, n_lo, n_hi, d_lo, d_hi,
+                               sb_lo, sb_hi, sb_lo, sb_hi, sbb - wide_h, sbb + wide_h)  # fmt: skip
+        cross = half_a * half_b * max(-ab_lo, ab_hi)
+        low = 0.5 * (min(aa_lo, 0.0) * half_a * half_a + min(bb_lo, 0.0) * half_b * half_b) - cross
+        high = 0.5 * (max(aa_hi, 0.0) * half_a * half_a + max(bb_hi, 0.0) * half_b * half_b) + cross
+        second = 0.5 * (high - low) * (1.0 + 1e-9) + 1e-11 * abs(value)
+        if second < error:
+            error = second
+            slope_a, slope_b = exact_a, exact_b
+            # The slopes are exact ones at the centre now; their spread by whichever bound is smaller.
+            wide_a = half_a * max(-aa_lo, aa_hi) + half_b * max(-ab_lo, ab_hi)
+            wide_b = half_a * max(-ab_lo, ab_hi) + half_b * max(-bb_lo, bb_hi)
+            spread_a = min(wide_a * (1.0 + 1e-9), max(wa_hi - exact_a, exact_a - wa_lo)) + 1e-11 * abs(exact_a)
+            spread_b = min(wide_b * (1.0 + 1e-9), max(wb_hi - exact_b, exact_b - wb_lo)) + 1e-11 * abs(exact_b)
+            value += 0.5 * (low + high)
+            reach = abs(slope_a) * half_a + abs(slope_b) * half_b + error
+            w_lo, w_hi = max(w_lo, value - reach), min(w_hi, value + reach)
     return value, slope_a, slope_b, error, spread_a, spread_b, w_lo, w_hi

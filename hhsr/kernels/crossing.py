@@ -37,13 +37,13 @@ SLOTS = 64  # pending tree nodes of one segment: three a level
 MERGE = 1e-9  # mm: a leaving and an entering closer than this are one touch
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def scratch():
     """Return (work, slots, pending): what one thread needs to follow segments."""
     return np.empty((PIECES, 8)), np.empty((SLOTS, 2)), np.empty(SLOTS, dtype=np.int64)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def part_crossings(blob, ints, part, px, py, pz, dx, dy, dz, t0, t1, state, out, count):
     """Follow a retained part: the exact crossings of the whole segment, and of them those in [t0, t1]."""
     if ints[part + TRIANGLES] == 0:
@@ -72,7 +72,7 @@ def part_crossings(blob, ints, part, px, py, pz, dx, dy, dz, t0, t1, state, out,
     return state, count
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def owner_crossings(
     blob, ints, tab, owner, px, py, pz, dx, dy, dz, t0, t1, resolution, tolerance, state, out, count, work
 ):
@@ -93,11 +93,13 @@ def owner_crossings(
     )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def follow_segment(
     blob, ints, tab, root, px, py, pz, ex, ey, ez, resolution, tolerance, first, out, work, slots, pending
 ):
-    """Return (start state, count) of the segment p → e in the tree's frame and the solid of node `root`; t of each change of state goes to `out`.
+    """Return (start state, count) of the segment p → e in the tree's frame and the solid of node `root`.
+
+    t of each change of state goes to `out`.
 
     first: stop after the first crossing. A count above out.size says how much room is needed.
     """
@@ -156,7 +158,7 @@ def follow_segment(
     return begin, count
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _merge_touches(out, count, gap):
     """Drop pairs of crossings closer than `gap`: rounding at the meeting of two proofs. Keeps the parity."""
     if count < 2 or count > out.shape[0]:
@@ -171,7 +173,7 @@ def _merge_touches(out, count, gap):
     return kept
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def cross_many(blob, starts, ends, resolution, tolerance, counts, begins, ts):
     """Follow (n, 3) → (n, 3) LPS segments. counts: (n,) crossings of each, −1 not finite. begins: (n,) start inside.
 
@@ -196,7 +198,7 @@ def cross_many(blob, starts, ends, resolution, tolerance, counts, begins, ts):
     return starts.shape[0], used
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def first_exits(blob, root, centre, rays, resolution, tolerance, out):
     """Fill (n,) share of the first exit of rays (n, 3) from a centre (3,), tree frame, out of the solid of node `root`.
 
@@ -214,9 +216,9 @@ def first_exits(blob, root, centre, rays, resolution, tolerance, out):
         out[i] = (t[0] if count > 0 else 1.0) if inside else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def first_many(blob, starts, ends, resolution, tolerance, out):
-    """Fill (n,) t of the first crossing of LPS segments: NaN where none, −1 where not finite; return how many are not."""
+    """Fill (n,) t of the first crossing of LPS segments: NaN none, −1 not finite; return how many are not finite."""
     ints, tab = integers(blob), tables(blob)
     work, slots, pending = scratch()
     t = np.empty(64)
@@ -235,7 +237,7 @@ def first_many(blob, starts, ends, resolution, tolerance, out):
     return bad
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _finite(starts, ends, i):
     for k in range(3):
         if not (math.isfinite(starts[i, k]) and math.isfinite(ends[i, k])):

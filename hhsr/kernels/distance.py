@@ -1,7 +1,7 @@
 """Signed distance, nearest point and clearance of the whole solid (DESIGN §2, §4).
 
-The surface nearest to a segment is on a patch of some owner (branch and bound), on the inside of a step face (then at the
-foot of one of the segment's ends on a cutting plane, where the two sides disagree), or on a straight edge where two
+The surface nearest to a segment is on a patch of some owner (branch and bound), on the inside of a step face (then at
+the foot of one of the segment's ends on a cutting plane, where the two sides disagree), or on a straight edge where two
 cutting planes meet (a short list made when the tree is compiled).
 """
 
@@ -59,7 +59,7 @@ from hhsr.kernels.tree import (
 SIDE = 1e-6  # mm: how far off a plane its two sides are asked
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def near_scratch():
     """Return (search, local, nodes, keys, corners, spare, rects): what one thread needs for a search."""
     return (
@@ -73,7 +73,7 @@ def near_scratch():
     )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def set_search(search, px, py, pz, dx, dy, dz, tolerance):
     """Begin a search about p + t·d."""
     search[START], search[START + 1], search[START + 2] = px, py, pz
@@ -84,7 +84,7 @@ def set_search(search, px, py, pz, dx, dy, dz, tolerance):
     search[TOLERANCE] = tolerance
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _nearest_on_owner(blob, ints, tab, owner, search, local, nodes, keys, corners, spare, rects):
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
     kind, record = ints[o + OWNER_KIND], ints[o + OWNER_RECORD]
@@ -106,7 +106,7 @@ def _nearest_on_owner(blob, ints, tab, owner, search, local, nodes, keys, corner
         offer(search, local[BEST], local[BEST_T], x + blob[frame], y + blob[frame + 1], z + blob[frame + 2])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _nearest_step(blob, ints, tab, search):
     """Offer the feet of the segment's ends on the cutting planes where the sides disagree, and the straight edges."""
     for end in range(2 if search[LENGTH2] > 0.0 else 1):
@@ -144,7 +144,7 @@ def _nearest_step(blob, ints, tab, search):
             offer(search, math.sqrt(d2), t, blob[o] + s * ux, blob[o + 1] + s * uy, blob[o + 2] + s * uz)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects):
     """Find the surface point nearest to the search's segment, to its tolerance: truth ∈ [best − tolerance, best]."""
     owners = ints[OWNER_COUNT]
@@ -162,7 +162,7 @@ def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, 
         search[BEST] = np.inf
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def nearest_many(blob, points, tolerance, distance, foot):
     """Fill (n,) signed distance (mm) and (n, 3) nearest surface point of LPS points; NaN where not finite.
 
@@ -185,9 +185,9 @@ def nearest_many(blob, points, tolerance, distance, foot):
     return bad
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _highest(px, py, pz, dx, dy, dz, t0, t1, ax, ay, az, bx, by, bz):
-    """Return (value², t) of the greatest of min(|p(t) − a|, |p(t) − b|)² on [t0, t1]: an upper bound of the distance."""
+    """Return the greatest min(|p(t) − a|, |p(t) − b|)² on [t0, t1], and its t: an upper bound of the distance²."""
     dd = dx * dx + dy * dy + dz * dz
     c0 = (px - ax) ** 2 + (py - ay) ** 2 + (pz - az) ** 2
     c1 = 2.0 * (dx * (px - ax) + dy * (py - ay) + dz * (pz - az))
@@ -211,7 +211,7 @@ def _highest(px, py, pz, dx, dy, dz, t0, t1, ax, ay, az, bx, by, bz):
     return best, where
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def deepest(
     blob, ints, tab, px, py, pz, dx, dy, dz, t0, t1, tolerance, floor, out,
     search, local, nodes, keys, corners, spare, rects, spans,
@@ -259,7 +259,7 @@ def deepest(
     return high
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def clearance_many(blob, starts, ends, tolerance, value, t, foot):
     """Fill (n,) clearance of the axes of LPS segments (no radius), (n,) where along it, (n, 3) the surface point there.
 

@@ -25,7 +25,7 @@ NODE_INT_SIZE, NODE_FLOAT_SIZE = 4, 8
 OWNER_INT_SIZE = 6
 OWNER_KIND, OWNER_RECORD, OWNER_PLANES, OWNER_PLANE_FLOATS, OWNER_NODE, OWNER_BOX = 0, 1, 2, 3, 4, 5
 
-# Model leaf record, integers: where its numbers lie (float slots), its lists (integer slots), its tables (float32 slots).
+# Model leaf record, integers: where its numbers (float slots), lists (integer slots) and tables (float32 slots) lie.
 HALF_AXES, AZIMUTH, AZIMUTH_COUNT, ELEVATION, ELEVATION_COUNT = 0, 1, 2, 3, 4
 CENTRES, CENTRE_COUNT = 5, 6  # rows of 5: unit vector, 1/(1 − cos σ), weight
 BLOCKS = 7  # 6·8·8 + 1 integer offsets, into the centres that are not 0 everywhere in a block of directions
@@ -37,18 +37,19 @@ CENTRE_SIZE = 5
 BLOCKS_PER_SIDE = 8
 BLOCK_COUNT = 6 * BLOCKS_PER_SIDE * BLOCKS_PER_SIDE
 
-# A cell of the finest level: |W − (value + slope_a·δa + slope_b·δb)| ≤ error, |∂W/∂a − slope_a| ≤ spread_a, same for b.
-CELL_SIZE = 6
-VALUE, SLOPE_A, SLOPE_B, ERROR, SPREAD_A, SPREAD_B = 0, 1, 2, 3, 4, 5
+# A cell of the finest level: |W − (value + slope_a·δa + slope_b·δb)| ≤ error, |∂W/∂a − slope_a| ≤ spread_a, same for b;
+# its surface lies within `radius` (mm) of dir(a, b)/value.
+CELL_SIZE = 8
+VALUE, SLOPE_A, SLOPE_B, ERROR, SPREAD_A, SPREAD_B, RADIUS = 0, 1, 2, 3, 4, 5, 6
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def integers(blob):
     """Return the blob as 64-bit integers."""
     return blob.view(np.int64)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def tables(blob):
     """Return the float32 tables."""
     return blob[blob.view(np.int64)[MAP_START] :].view(np.float32)

@@ -13,6 +13,7 @@ from hhsr.kernels.cell import cell_model, direction_of
 from hhsr.kernels.layout import (
     BLOCKS_PER_SIDE,
     ERROR,
+    RADIUS,
     SLOPE_A,
     SLOPE_B,
     SPREAD_A,
@@ -24,7 +25,7 @@ from hhsr.kernels.layout import (
 UP = 1.0 + 3e-7  # more than one float32 rounding
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def level_start(cells, side):
     """Return the index of the first pyramid node of the level with `side` cells a face side."""
     start = 0
@@ -35,19 +36,19 @@ def level_start(cells, side):
     return start
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def pyramid_size(cells):
     """Return how many nodes the pyramid above `cells`² cells a face has."""
     return level_start(cells, 1) + 6
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def quad_radius_ok(value, slope_a, slope_b, error, half_a, half_b):
     """Return whether the tangent plane of a cell faces the centre safely, so that its corners are points in space."""
     return value - abs(slope_a) * half_a - abs(slope_b) * half_b - error > 0.25 * value
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def model_thickness(face, a, b, half_a, half_b, value, slope_a, slope_b, error):
     """Return how far (mm) surface and tangent plane of a cell can lie apart along a ray: |dir|·e / (T·(T − e))."""
     reach_a, reach_b = abs(a) + half_a, abs(b) + half_b
@@ -55,39 +56,33 @@ def model_thickness(face, a, b, half_a, half_b, value, slope_a, slope_b, error):
     return math.sqrt(1.0 + reach_a * reach_a + reach_b * reach_b) * error / (low * (low - error)) * (1.0 + 1e-9)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def cell_sphere(face, a, b, half_a, half_b, value, slope_a, slope_b, error, lo, hi):
-    """Return (x, y, z, radius) of a sphere, leaf frame, that encloses the surface of a cell."""
+    """Return (x, y, z, radius) of a sphere about dir(a, b)/value, leaf frame, that encloses the surface of a cell."""
     if quad_radius_ok(value, slope_a, slope_b, error, half_a, half_b):
         grow = model_thickness(face, a, b, half_a, half_b, value, slope_a, slope_b, error)
         flat = True
     else:
         grow, flat = 0.0, False
-    cx = cy = cz = 0.0
-    count = 0
+    cx, cy, cz = direction_of(face, a, b)
+    cx, cy, cz = cx / value, cy / value, cz / value
     radius = 0.0
-    for run in range(2):
-        for corner in range(4):
-            da = half_a if corner & 1 else -half_a
-            db = half_b if corner & 2 else -half_b
-            x, y, z = direction_of(face, a + da, b + db)
-            for end in range(1 if flat else 2):
-                w = value + slope_a * da + slope_b * db if flat else (lo if end == 0 else hi)
-                if run == 0:
-                    cx, cy, cz, count = cx + x / w, cy + y / w, cz + z / w, count + 1
-                else:
-                    d = (x / w - cx) ** 2 + (y / w - cy) ** 2 + (z / w - cz) ** 2
-                    radius = max(radius, math.sqrt(d))
-        if run == 0:
-            cx, cy, cz = cx / count, cy / count, cz / count
+    for corner in range(4):
+        da = half_a if corner & 1 else -half_a
+        db = half_b if corner & 2 else -half_b
+        x, y, z = direction_of(face, a + da, b + db)
+        for end in range(1 if flat else 2):
+            w = value + slope_a * da + slope_b * db if flat else (lo if end == 0 else hi)
+            d = (x / w - cx) ** 2 + (y / w - cy) ** 2 + (z / w - cz) ** 2
+            radius = max(radius, math.sqrt(d))
     return cx, cy, cz, (radius + grow) * (1.0 + 1e-9)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def build_map(blob, leaf, cells, models, ranges, spheres, box):
     """Fill the tables of one leaf and its box: (8,) lowest 3, highest 3, least and greatest |p|∞ of its surface.
 
-    models: (6, cells, cells, 6) float32. ranges: (nodes, 2) float32. spheres: (nodes, 4) float32.
+    models: (6, cells, cells, CELL_SIZE) float32. ranges: (nodes, 2) float32. spheres: (nodes, 4) float32.
     """
     ints = integers(blob)
     half = 1.0 / cells
@@ -105,6 +100,7 @@ def build_map(blob, leaf, cells, models, ranges, spheres, box):
                 out[ERROR] = (error + 1e-7 * (value + (abs(ga) + abs(gb)) * half)) * UP
                 span[i, j, 0], span[i, j, 1] = lo, hi
                 cx, cy, cz, radius = cell_sphere(face, a, b, half, half, value, ga, gb, error, lo, hi)
+                out[RADIUS] = (radius + 1e-7 * (abs(cx) + abs(cy) + abs(cz))) * UP
                 fine[i, j, 0], fine[i, j, 1], fine[i, j, 2], fine[i, j, 3] = cx, cy, cz, radius
                 box[6], box[7] = min(box[6], 1.0 / hi), max(box[7], 1.0 / lo)
                 for corner in range(4):

@@ -1,9 +1,9 @@
 """The nearest point of one owner's surface to a segment (a point is a segment of no length): branch and bound.
 
-A search is a float array: SEARCH_* slots hold the segment in the owner's frame, and the best point so far. A node of the
-cube map is discarded when its enclosing sphere, cut off by no plane of the region, lies no nearer than the best point
-less the tolerance; a cell when its flat quad, clipped to the region and widened by its proven thickness, does; what is
-left is parted, down to the tolerance.
+A search is a float array: SEARCH_* slots hold the segment in the owner's frame, and the best point so far. A node of
+the cube map is discarded when its enclosing sphere, cut off by no plane of the region, lies no nearer than the best
+point less the tolerance; a cell when its flat quad, clipped to the region and widened by its proven thickness, does;
+what is left is parted, down to the tolerance.
 """
 
 import math
@@ -20,6 +20,7 @@ from hhsr.kernels.layout import (
     ERROR,
     OWNER_PLANE_FLOATS,
     OWNER_PLANES,
+    RADIUS,
     SLOPE_A,
     SLOPE_B,
     SPHERE_TABLE,
@@ -36,7 +37,7 @@ FAR = 1e150  # mm: no surface point found yet; finite, so that "no surface here"
 FINEST = 1e-5  # mm: a piece of surface smaller than this is taken as a point
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def distance_to(search, x, y, z):
     """Return (distance, t) of a point to the search's segment."""
     dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
@@ -48,7 +49,7 @@ def distance_to(search, x, y, z):
     return math.sqrt(rx * rx + ry * ry + rz * rz), t
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def offer(search, distance, t, x, y, z):
     """Take a surface point as the best one if it is nearer."""
     if distance < search[BEST]:
@@ -56,7 +57,7 @@ def offer(search, distance, t, x, y, z):
         search[FOOT], search[FOOT + 1], search[FOOT + 2] = x, y, z
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def outside_region(blob, planes, count, x, y, z, radius):
     """Return whether a ball lies wholly outside the region."""
     for k in range(count):
@@ -66,7 +67,7 @@ def outside_region(blob, planes, count, x, y, z, radius):
     return False
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def offer_patch_point(blob, ints, leaf, planes, count, search, face, x, y, z, shrink):
     """Project a point near a patch along its ray to the exact surface and offer it, if it lies in the region.
 
@@ -93,13 +94,13 @@ def offer_patch_point(blob, ints, leaf, planes, count, search, face, x, y, z, sh
         x, y, z = sx - back * blob[at], sy - back * blob[at + 1], sz - back * blob[at + 2]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def cell_bound(
     blob, ints, leaf, planes, count, search, face, a, b, half_a, half_b, value, ga, gb, error, corners, spare
 ):
     """Return a lower bound of the segment's distance to the cell's surface in the region; offer a point of it.
 
-    Infinite where no surface of the cell lies in the region. A cell too steep for its tangent plane is bounded by a sphere.
+    Infinite where no surface of the cell lies in the region. A cell too steep for its plane is bounded by a sphere.
     """
     if not quad_radius_ok(value, ga, gb, error, half_a, half_b):
         reach = abs(ga) * half_a + abs(gb) * half_b + error
@@ -112,6 +113,22 @@ def cell_bound(
         offer_patch_point(blob, ints, leaf, planes, count, search, face, x, y, z, radius)
         return distance - radius
     thick = model_thickness(face, a, b, half_a, half_b, value, ga, gb, error)
+    c = value - ga * a - gb * b
+    if face % 2 == 1:
+        c = -c
+    if face < 2:
+        gx, gy, gz = c, ga, gb
+    elif face < 4:
+        gx, gy, gz = gb, c, ga
+    else:
+        gx, gy, gz = ga, gb, c
+    if search[LENGTH2] == 0.0:
+        # A point: its distance to the whole plane is often bound enough, and where its foot lies in the quad, exact.
+        gg = gx * gx + gy * gy + gz * gz
+        h = gx * search[START] + gy * search[START + 1] + gz * search[START + 2] - 1.0
+        low = abs(h) / math.sqrt(gg) - thick
+        if low > search[BEST] - search[TOLERANCE]:
+            return low
     for corner in range(4):
         da = half_a if corner == 1 or corner == 2 else -half_a
         db = half_b if corner >= 2 else -half_b
@@ -124,15 +141,6 @@ def cell_bound(
         size = clip_polygon(corners, size, spare, blob[o], blob[o + 1], blob[o + 2], blob[o + 3] + thick)
         if size == 0:
             return np.inf
-    c = value - ga * a - gb * b
-    if face % 2 == 1:
-        c = -c
-    if face < 2:
-        gx, gy, gz = c, ga, gb
-    elif face < 4:
-        gx, gy, gz = gb, c, ga
-    else:
-        gx, gy, gz = ga, gb, c
     distance, _, x, y, z = polygon_to_segment(
         corners,
         size,
@@ -152,7 +160,7 @@ def cell_bound(
     return low
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, corners, spare, rects):
     """Part a cell of the finest level until what is left of it can hold no nearer point."""
     depth = 0
@@ -167,7 +175,7 @@ def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, corne
         base = depth
         for corner in range(4):
             ca, cb = a + (half if corner & 1 else -half), b + (half if corner & 2 else -half)
-            value, ga, gb, error, _, _, lo, hi = cell_model(blob, ints, leaf, face, ca, cb, half, half)
+            value, ga, gb, error, _, _, lo, _ = cell_model(blob, ints, leaf, face, ca, cb, half, half)
             low = cell_bound(
                 blob, ints, leaf, planes, count, search, face, ca, cb, half, half, value, ga, gb, error, corners, spare
             )
@@ -189,7 +197,7 @@ def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, corne
             depth += 1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def nearest_on_leaf(blob, ints, tab, leaf, planes, count, search, nodes, keys, corners, spare, rects):
     """Improve the search by the surface of a model leaf within its region. nodes: scratch; keys: their bounds."""
     n = ints[leaf + CELLS]
@@ -226,6 +234,14 @@ def nearest_on_leaf(blob, ints, tab, leaf, planes, count, search, nodes, keys, c
             else:
                 o = ints[leaf + CELL_TABLE] + CELL_SIZE * ((face * n + ci) * n + cj)
                 a, b, half = (2 * ci + 1) / n - 1.0, (2 * cj + 1) / n - 1.0, 1.0 / n
+                m = 1.0 / tab[o + VALUE]
+                x, y, z = direction_of(face, a, b)
+                x, y, z, radius = x * m, y * m, z * m, tab[o + RADIUS]
+                distance, _ = distance_to(search, x, y, z)
+                if distance - radius > search[BEST] - search[TOLERANCE]:
+                    continue
+                if outside_region(blob, planes, count, x, y, z, radius):
+                    continue
                 low = cell_bound(
                     blob, ints, leaf, planes, count, search, face, a, b, half, half,
                     tab[o + VALUE], tab[o + SLOPE_A], tab[o + SLOPE_B], tab[o + ERROR], corners, spare,
@@ -250,7 +266,7 @@ def nearest_on_leaf(blob, ints, tab, leaf, planes, count, search, nodes, keys, c
             )  # fmt: skip
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def owner_planes(ints, owner):
     """Return (float slot, number) of the planes of an owner's region, in the owner's frame."""
     return ints[owner + OWNER_PLANE_FLOATS], ints[owner + OWNER_PLANES]

@@ -9,7 +9,7 @@ from hhsr.kernels.part import TRIANGLES, part_arrays
 from hhsr.kernels.polygon import clip_polygon, polygon_to_segment, segment_to_segment
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def box_bound(box, search):
     """Return a lower bound of the segment's distance to a box (6,): exact for a point, by spheres else."""
     if search[LENGTH2] == 0.0:
@@ -34,7 +34,7 @@ def box_bound(box, search):
     return max(math.sqrt(d2), sphere)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def triangle_bound(corner, blob, planes, count, search, corners, spare):
     """Offer the nearest point of one triangle within the region."""
     for i in range(3):
@@ -94,7 +94,7 @@ def triangle_bound(corner, blob, planes, count, search, corners, spare):
         offer(search, math.sqrt(d2), t, corners[i, 0] + s * ux, corners[i, 1] + s * uy, corners[i, 2] + s * uz)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def nearest_on_part(blob, ints, part, planes, count, search, nodes, keys, corners, spare):
     """Improve the search by the triangles of a retained part, each clipped to the region."""
     if ints[part + TRIANGLES] == 0:

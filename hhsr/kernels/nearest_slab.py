@@ -20,7 +20,7 @@ from hhsr.kernels.slab import (
 from hhsr.kernels.slab_bounds import STEP, lobe_model
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _is_surface(blob, ints, slab, lobe, planes, count, x, y, z, u, v, t):
     """Return whether a strip's point lies in the region and in no other lobe."""
     if outside_region(blob, planes, count, x, y, z, 1e-9):
@@ -35,7 +35,7 @@ def _is_surface(blob, ints, slab, lobe, planes, count, x, y, z, u, v, t):
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _offer_strip_point(blob, ints, slab, lobe, planes, count, search, x, y, z, shrink):
     """Move a point near a strip along its ray in the plane to the exact strip and offer it, if that is surface."""
     f = ints[slab + SLAB_FRAME]
@@ -70,7 +70,7 @@ def _offer_strip_point(blob, ints, slab, lobe, planes, count, search, x, y, z, s
         x, y, z = x - back * blob[at], y - back * blob[at + 1], z - back * blob[at + 2]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def strip_bound(blob, ints, slab, lobe, segment, planes, count, search, angle, t, half, half_t, corners, spare):
     """Return a lower bound of the segment's distance to a piece of strip in the region; offer a point of it.
 
@@ -141,7 +141,7 @@ def strip_bound(blob, ints, slab, lobe, segment, planes, count, search, angle, t
     return distance - thick
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _refine_segment(blob, ints, slab, lobe, segment, planes, count, search, corners, spare, rects):
     """Part the strip over one segment of the tables until nothing left of it can be nearer."""
     d = blob[ints[slab + SLAB_FRAME] + 10]
@@ -173,7 +173,7 @@ def _refine_segment(blob, ints, slab, lobe, segment, planes, count, search, corn
         depth += 2
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def nearest_on_slab(blob, ints, slab, planes, count, search, corners, spare, rects):
     """Improve the search by the strips of a slab within its region: the nearest segment first, then all that remain."""
     for k in range(ints[slab + LOBE_COUNT]):

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from hhsr.kernels.cell import direction_of
+from hhsr.kernels.cell import cell_model, direction_of
 from hhsr.kernels.layout import (
     CELL_SIZE,
     CELL_TABLE,
@@ -15,19 +15,33 @@ from hhsr.kernels.layout import (
     integers,
     tables,
 )
-from hhsr.kernels.maps import model_thickness, quad_radius_ok
+from hhsr.kernels.maps import cell_sphere, model_thickness, quad_radius_ok
+from hhsr.kernels.nearest import outside_region
 from hhsr.kernels.part import TRIANGLES, part_arrays
 from hhsr.kernels.polygon import ROOM, clip_polygon
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _add(box, rotation, x, y, z, grow):
     for k in range(3):
         v = rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2] * z
         box[k], box[3 + k] = min(box[k], v - grow), max(box[3 + k], v + grow)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy")
+def _add_steep(blob, ints, leaf, planes, count, face, a, b, half, rotation, box):
+    """Add a cell too steep for its tangent plane, in 16 × 16 parts, each by its enclosing sphere."""
+    part = half / 16.0
+    for i in range(16):
+        for j in range(16):
+            ca, cb = a - half + (2 * i + 1) * part, b - half + (2 * j + 1) * part
+            value, ga, gb, error, _, _, lo, hi = cell_model(blob, ints, leaf, face, ca, cb, part, part)
+            x, y, z, radius = cell_sphere(face, ca, cb, part, part, value, ga, gb, error, lo, hi)
+            if not outside_region(blob, planes, count, x, y, z, radius):
+                _add(box, rotation, x, y, z, radius)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def leaf_box(blob, leaf, planes, count, rotation, box):
     """Fill (6,) lowest and highest corner of R·(surface of a model leaf within its region); lowest > highest: empty."""
     ints, tab = integers(blob), tables(blob)
@@ -43,10 +57,9 @@ def leaf_box(blob, leaf, planes, count, rotation, box):
                 value, ga, gb, error = tab[o + VALUE], tab[o + SLOPE_A], tab[o + SLOPE_B], tab[o + ERROR]
                 if quad_radius_ok(value, ga, gb, error, half, half):
                     thick = model_thickness(face, a, b, half, half, value, ga, gb, error)
-                else:  # a steep cell: twice its middle radius is a safe overestimate of nothing; take its range
-                    ga, gb, thick = 0.0, 0.0, 0.0
-                    low = max(value - (abs(tab[o + SLOPE_A]) + abs(tab[o + SLOPE_B])) * half - error, 0.05 * value)
-                    thick = 1.7320508075688772 * (1.0 / low - 1.0 / value)
+                else:  # a steep cell: by spheres about its parts
+                    _add_steep(blob, ints, leaf, planes, count, face, a, b, half, rotation, box)
+                    continue
                 for corner in range(4):
                     da = half if corner == 1 or corner == 2 else -half
                     db = half if corner >= 2 else -half
@@ -61,7 +74,7 @@ def leaf_box(blob, leaf, planes, count, rotation, box):
                     _add(box, rotation, corners[k, 0], corners[k, 1], corners[k, 2], thick)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def part_box(blob, part, planes, count, rotation, box):
     """Fill (6,) the same of a retained part's triangles within its region."""
     ints = integers(blob)

@@ -31,7 +31,7 @@ PIECES = 64  # depth of the bisection
 UNDECIDED = 2
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def emit(state, new, t, out, count):
     """Record a change of state at t; return (state, count). A count above out.size says how much room is needed."""
     if state != new:
@@ -41,7 +41,7 @@ def emit(state, new, t, out, count):
     return state, count
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def clip_to_box(box_lo, box_hi, p, d, t0, t1):
     """Return the interval of t in [t0, t1] in which one coordinate p + t·d lies in [lo, hi]."""
     if d == 0.0:
@@ -54,7 +54,7 @@ def clip_to_box(box_lo, box_hi, p, d, t0, t1):
     return max(t0, a), min(t1, b)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _range_of(tab, ints, leaf, face, side, i0, i1, j0, j1):
     """Return (lo, hi) of W over pyramid nodes i0 … i1, j0 … j1 of a level."""
     lo, hi = np.float32(1e30), np.float32(0.0)
@@ -66,12 +66,12 @@ def _range_of(tab, ints, leaf, face, side, i0, i1, j0, j1):
     return lo, hi
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _index(x, side):
     return min(max(int((x + 1.0) * 0.5 * side), 0), side - 1)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def solve_in_cell(blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, x0, x1, f0, f1, slope, tolerance):
     """Return the share x in [x0, x1] where w = W: Newton on the proven slope, safeguarded by the bracket.
 
@@ -98,14 +98,14 @@ def solve_in_cell(blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, x0, x1, f0, f1
     return 0.5 * (lo + hi)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def share_to_t(x, t0, t1, w0, w1):
     """Return t of the point at share x of a piece in the chart: t is linear in space, x in the projection."""
     p, q = (1.0 - x) * w0, x * w1
     return (t0 * p + t1 * q) / (p + q)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def leaf_crossings(
     blob, ints, tab, leaf, px, py, pz, dx, dy, dz, t0, t1, resolution, tolerance, state, out, count, work
 ):
@@ -209,7 +209,7 @@ def leaf_crossings(
     return state, count
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _face_crossings(
     blob, ints, tab, leaf, face, px, py, pz, dx, dy, dz, ta, tb, speed, resolution, tolerance, state, out, count, work
 ):
@@ -284,7 +284,7 @@ def _face_crossings(
         t1, a1, b1, w1 = work[depth, 4], work[depth, 5], work[depth, 6], work[depth, 7]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _settle(
     blob, ints, leaf, face, t0, a0, b0, w0, t1, a1, b1, w1,
     ca, cb, value, ga, gb, error, sa, sb, last, speed, resolution, tolerance, state, out, count,
@@ -327,7 +327,13 @@ def _settle(
             state, count = emit(state, g1 >= 0.0, share_to_t(x, t0, t1, w0, w1), out, count)
         return 3, state, count
     if last and length <= resolution:
-        state, count = emit(state, w0 >= inverse_radius(blob, ints, leaf, face, a0, b0), t0, out, count)
-        state, count = emit(state, w1 >= inverse_radius(blob, ints, leaf, face, a1, b1), t1, out, count)
+        g0 = w0 - inverse_radius(blob, ints, leaf, face, a0, b0)
+        g1 = w1 - inverse_radius(blob, ints, leaf, face, a1, b1)
+        state, count = emit(state, g0 >= 0.0, t0, out, count)
+        if (g0 >= 0.0) != (g1 >= 0.0):
+            x = solve_in_cell(
+                blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, 0.0, 1.0, g0, g1, 0.0, tolerance / max(length, 1e-12)
+            )
+            state, count = emit(state, g1 >= 0.0, share_to_t(x, t0, t1, w0, w1), out, count)
         return 3, state, count
     return UNDECIDED, state, count

@@ -37,7 +37,7 @@ from hhsr.kernels.slab import slab_contains, slab_field
 INSIDE, OUTSIDE, INVALID = 1, 0, -1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def into_tree(blob, ints, x, y, z):
     """Return an LPS point in the tree's frame."""
     o = ints[POSE]
@@ -49,7 +49,7 @@ def into_tree(blob, ints, x, y, z):
     )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def out_of_tree(blob, ints, x, y, z):
     """Return a point of the tree's frame in LPS."""
     o = ints[POSE]
@@ -60,7 +60,7 @@ def out_of_tree(blob, ints, x, y, z):
     )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def into_leaf(blob, ints, leaf, x, y, z):
     """Return a point of the tree's frame in the leaf's frame."""
     o = ints[leaf + FRAME]
@@ -70,7 +70,7 @@ def into_leaf(blob, ints, leaf, x, y, z):
     return turn_into_leaf(blob, o, x, y, z)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def turn_into_leaf(blob, frame, x, y, z):
     """Return a vector of the tree's frame in the frame whose numbers start at `frame`."""
     return (
@@ -80,7 +80,7 @@ def turn_into_leaf(blob, frame, x, y, z):
     )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def turn_out_of_leaf(blob, frame, x, y, z):
     """Return a vector of a leaf's frame in the tree's frame."""
     return (
@@ -90,7 +90,7 @@ def turn_out_of_leaf(blob, frame, x, y, z):
     )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def owner_of(blob, ints, root, x, y, z):
     """Return the index of the owner, below node `root`, of the region that holds a point of the tree's frame."""
     node = root
@@ -105,12 +105,12 @@ def owner_of(blob, ints, root, x, y, z):
         node = ints[i + 2] if h >= 0.0 else ints[i + 1]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def leaf_contains(blob, ints, tab, leaf, x, y, z):
-    """Return whether a model leaf holds a point of its frame: by its map, by the exact formula where that is undecided."""
-    face, a, b, m = face_of(x, y, z)
-    if m == 0.0:
+    """Return whether a model leaf holds a point of its frame: by its map, where undecided by the exact formula."""
+    if x == 0.0 and y == 0.0 and z == 0.0:
         return True
+    face, a, b, m = face_of(x, y, z)
     n = ints[leaf + CELLS]
     half = 0.5 * n
     i, j = min(int((a + 1.0) * half), n - 1), min(int((b + 1.0) * half), n - 1)
@@ -124,7 +124,7 @@ def leaf_contains(blob, ints, tab, leaf, x, y, z):
     return leaf_implicit(blob, ints, leaf, x, y, z) <= 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def owner_contains(blob, ints, tab, owner, x, y, z):
     """Return whether an owner's solid holds a point of the tree's frame, by the owner's own formula."""
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
@@ -137,13 +137,13 @@ def owner_contains(blob, ints, tab, owner, x, y, z):
     return slab_contains(blob, ints, record, x, y, z)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def contains_point(blob, ints, tab, root, x, y, z):
     """Return whether the solid of node `root` holds a point of the tree's frame; on the surface is inside."""
     return owner_contains(blob, ints, tab, owner_of(blob, ints, root, x, y, z), x, y, z)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def contains_one(blob, point):
     """Return 1 inside, 0 outside, −1 not finite, for an LPS point (3,)."""
     ints, tab = integers(blob), tables(blob)
@@ -153,7 +153,7 @@ def contains_one(blob, point):
     return INSIDE if contains_point(blob, ints, tab, 0, x, y, z) else OUTSIDE
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def contains_many(blob, points, out):
     """Fill (n,) int8 with 1 inside, 0 outside, −1 not finite; return how many are not finite."""
     ints, tab = integers(blob), tables(blob)
@@ -170,9 +170,9 @@ def contains_many(blob, points, out):
     return bad
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def field_point(blob, ints, x, y, z):
-    """Return the implicit value of a point of the tree's frame: G of its leaf, (r' − r)/r in a slab, distance/extent."""
+    """Return the implicit value at a point of the tree's frame: G of a leaf, gap/r in a slab, distance/extent."""
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner_of(blob, ints, 0, x, y, z)
     kind, record = ints[o + OWNER_KIND], ints[o + OWNER_RECORD]
     if kind == MODEL:
@@ -183,7 +183,7 @@ def field_point(blob, ints, x, y, z):
     return slab_field(blob, ints, record, x, y, z)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def field_many(blob, points, out):
     """Fill (n,) implicit values of LPS points; NaN where not finite; return how many are not."""
     ints = integers(blob)

@@ -1,0 +1,232 @@
+"""This engine and its peers in one process, interleaved, on the same points and segments: rates and ratios.
+
+    python benchmarks/bench_queries.py MESH [--frame LPS] [--max-parameters 989] [--count 20000] [--rounds 5] [--growth]
+
+Ours answers on the fit, the peers on the source mesh. Peers that are not installed are left out, and said so; the extra
+`bench` has them. A rate is the best of the rounds; every round asks every engine once, so that a load on the machine
+falls on all. Rates mean something only side by side in one run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numba
+import numpy as np
+
+import hhsr
+from hhsr.model import Cut, ModelLeaf, Node, Tree, frozen, leaves
+from hhsr.shape import Shape
+
+Query = Callable[[], Any]
+
+
+def cases(shape: Shape, count: int, seed: int = 0) -> dict[str, tuple[np.ndarray, ...]]:
+    """Return the points and segments: uniform in the box, within ±2 mm of the surface, long segments."""
+    rng = np.random.default_rng(seed)
+    low, high = shape.bounds
+    uniform = rng.uniform(low, high, (count, 3))
+    foot, _ = shape.closest_point(rng.uniform(low, high, (count, 3)))
+    way = rng.normal(size=(count, 3))
+    way /= np.sqrt((way**2).sum(axis=1))[:, None]
+    near = foot + way * rng.uniform(0, 2, (count, 1))
+    return {"uniform": (uniform,), "near": (near,), "segments": (uniform, rng.uniform(low, high, (count, 3)))}
+
+
+def ours(shape: Shape, given: dict[str, tuple[np.ndarray, ...]]) -> dict[str, Query]:
+    """Return our queries by name."""
+    uniform, near, (starts, ends) = given["uniform"][0], given["near"][0], given["segments"]
+    few = len(starts) // 20
+    return {
+        "contains, uniform": lambda: shape.contains(uniform),
+        "contains, ±2 mm": lambda: shape.contains(near),
+        "all crossings": lambda: shape.crossings(starts, ends),
+        "first crossing": lambda: shape.first_crossing(starts, ends),
+        "signed distance, uniform": lambda: shape.signed_distance(uniform[: 4 * few]),
+        "signed distance, ±2 mm": lambda: shape.signed_distance(near[: 4 * few]),
+        "capsule clearance": lambda: shape.clearance(starts[:few], ends[:few], 1.0),
+    }
+
+
+def sizes(given: dict[str, tuple[np.ndarray, ...]]) -> dict[str, int]:
+    """Return how many rows each query answers."""
+    n = len(given["uniform"][0])
+    return {
+        "contains, uniform": n,
+        "contains, ±2 mm": n,
+        "all crossings": n,
+        "first crossing": n,
+        "signed distance, uniform": 4 * (n // 20),
+        "signed distance, ±2 mm": 4 * (n // 20),
+        "capsule clearance": n // 20,
+    }
+
+
+def open3d_queries(vertices: np.ndarray, faces: np.ndarray, given: dict[str, Any], threads: int) -> dict[str, Query]:
+    """Return Open3D's queries (embree)."""
+    import open3d
+
+    scene = open3d.t.geometry.RaycastingScene(nthreads=threads)
+    scene.add_triangles(open3d.core.Tensor(vertices.astype(np.float32)), open3d.core.Tensor(faces.astype(np.uint32)))
+    as_tensor = open3d.core.Tensor
+    uniform, near = (as_tensor(given[k][0].astype(np.float32)) for k in ("uniform", "near"))
+    starts, ends = given["segments"]
+    rays = as_tensor(np.concatenate([starts, ends - starts], axis=1).astype(np.float32))
+    few = 4 * (len(starts) // 20)
+    part_u, part_n = uniform[:few], near[:few]
+    options = {"nthreads": threads}
+    return {
+        "contains, uniform": lambda: scene.compute_occupancy(uniform, **options),
+        "contains, ±2 mm": lambda: scene.compute_occupancy(near, **options),
+        "all crossings": lambda: scene.list_intersections(rays, **options),
+        "first crossing": lambda: scene.cast_rays(rays, **options),
+        "signed distance, uniform": lambda: scene.compute_signed_distance(part_u, **options),
+        "signed distance, ±2 mm": lambda: scene.compute_signed_distance(part_n, **options),
+    }
+
+
+def embreex_queries(vertices: np.ndarray, faces: np.ndarray, given: dict[str, Any], threads: int) -> dict[str, Query]:
+    """Return embreex's queries, through trimesh."""
+    import embreex  # noqa: F401
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    starts, ends = given["segments"]
+    return {
+        "contains, uniform": lambda: mesh.ray.contains_points(given["uniform"][0]),
+        "contains, ±2 mm": lambda: mesh.ray.contains_points(given["near"][0]),
+        "all crossings": lambda: mesh.ray.intersects_id(starts, ends - starts, multiple_hits=True),
+        "first crossing": lambda: mesh.ray.intersects_first(starts, ends - starts),
+    }
+
+
+def libigl_queries(vertices: np.ndarray, faces: np.ndarray, given: dict[str, Any], threads: int) -> dict[str, Query]:
+    """Return libigl's signed distance (pseudonormals)."""
+    import igl
+
+    few = 4 * (len(given["uniform"][0]) // 20)
+    kind = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+    return {
+        "signed distance, uniform": lambda: igl.signed_distance(given["uniform"][0][:few], vertices, faces, kind),
+        "signed distance, ±2 mm": lambda: igl.signed_distance(given["near"][0][:few], vertices, faces, kind),
+    }
+
+
+PEERS = {"Open3D": open3d_queries, "embreex": embreex_queries, "libigl": libigl_queries}
+
+
+def best_of(engines: dict[str, dict[str, Query]], rounds: int) -> dict[str, dict[str, float]]:
+    """Return each engine's least time (s) by query; each round asks every engine once, one after another."""
+    least: dict[str, dict[str, float]] = {name: {} for name in engines}
+    for turn in range(rounds + 1):
+        for query in sorted({q for queries in engines.values() for q in queries}):
+            for name, queries in engines.items():
+                if query not in queries:
+                    continue
+                start = time.perf_counter()
+                queries[query]()
+                spent = time.perf_counter() - start
+                if turn > 0:  # the first round warms up
+                    least[name][query] = min(least[name].get(query, np.inf), spent)
+    return least
+
+
+def single_calls(shape: Shape, given: dict[str, tuple[np.ndarray, ...]], calls: int) -> None:
+    """Print the median and the 99.9th percentile of one call from Python, µs."""
+    points, (starts, ends) = given["uniform"][0], given["segments"]
+    queries: dict[str, Callable[[int], Any]] = {
+        "contains": lambda i: shape.contains(points[i]),
+        "crossings": lambda i: shape.crossings(starts[i], ends[i]),
+        "signed distance": lambda i: shape.signed_distance(points[i]),
+        "capsule clearance": lambda i: shape.clearance(starts[i], ends[i], 1.0),
+    }
+    for name, query in queries.items():
+        spent = np.empty(calls)
+        for i in range(calls):
+            start = time.perf_counter()
+            query(i % len(points))
+            spent[i] = time.perf_counter() - start
+        median, tail = np.percentile(spent, [50, 99.9]) * 1e6
+        print(f"  one call, {name:20s} median {median:8.1f} µs   p99.9 {tail:9.1f} µs")
+
+
+def grown(leaf: ModelLeaf, depth: int, rng: np.random.Generator) -> Node:
+    """Return a balanced tree of 2^depth copies of a leaf, moved about: for the cost in leaves."""
+    if depth == 0:
+        return replace(leaf, centre=frozen(rng.normal(size=3) * 15))
+    return Cut(
+        frozen([rng.uniform(-3, 3), rng.uniform(-1.5, 1.5)]),
+        float(rng.normal() * 10),
+        0.0,
+        (),
+        grown(leaf, depth - 1, rng),
+        grown(leaf, depth - 1, rng),
+    )
+
+
+def growth(leaf: ModelLeaf, count: int, rounds: int) -> None:
+    """Print how our rates change with the number of leaves and of parameters."""
+    for depth in range(7):
+        shape = Shape(Tree(grown(leaf, depth, np.random.default_rng(depth)), frozen(np.zeros(6)))).warm_up()
+        given = cases(shape, count)
+        least = best_of({"ours": ours(shape, given)}, rounds)["ours"]
+        rates = "  ".join(f"{q.split(',')[0]} {sizes(given)[q] / t / 1e3:.0f}k/s" for q, t in least.items())
+        print(
+            f"  {2**depth:3d} leaves, {shape.parameters:6d} parameters, {shape.compiled.nbytes / 1e6:5.1f} MB: {rates}"
+        )
+
+
+def main() -> None:
+    """Run the benchmark from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("mesh")
+    parser.add_argument("--frame", default="LPS")
+    parser.add_argument("--max-parameters", type=int, default=989)
+    parser.add_argument("--shape", help="a .hhsr file instead of a new fit")
+    parser.add_argument("--count", type=int, default=20_000)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--calls", type=int, default=10_000)
+    parser.add_argument("--threads", type=int, nargs="+", default=[1])
+    parser.add_argument("--growth", action="store_true")
+    arguments = parser.parse_args()
+    surface = hhsr.read_surface(arguments.mesh, frame=arguments.frame)
+    if arguments.shape:
+        shape = hhsr.load(arguments.shape)
+    else:
+        shape = hhsr.fit(surface, hhsr.FitOptions(max_parameters=arguments.max_parameters))
+    shape.warm_up()
+    start = time.perf_counter()
+    again = Shape(shape.tree)
+    compiled = again.compiled
+    print(
+        f"{shape.parameters} parameters, {shape.bytes} bytes; compiled in {time.perf_counter() - start:.2f} s", end=", "
+    )
+    print(f"{compiled.nbytes / 1e6:.1f} MB; the mesh has {len(surface.faces)} triangles")
+    given = cases(shape, arguments.count)
+    for threads in arguments.threads:
+        numba.set_num_threads(threads)
+        engines = {"ours": ours(shape, given)}
+        for name, make in PEERS.items():
+            try:
+                engines[name] = make(surface.vertices, surface.faces, given, threads)
+            except ImportError:
+                print(f"  {name} is not installed: left out")
+        least = best_of(engines, arguments.rounds)
+        print(f"{threads} thread(s), queries per second:")
+        for query, rows in sizes(given).items():
+            rates = {name: rows / times[query] for name, times in least.items() if query in times}
+            peers = [rate for name, rate in rates.items() if name != "ours"]
+            ratio = f"ours / best peer = {rates['ours'] / max(peers):.2f}" if peers else "no peer"
+            print(f"  {query:26s} " + "  ".join(f"{n} {r / 1e3:9.1f}k" for n, r in rates.items()) + f"   {ratio}")
+    single_calls(shape, given, arguments.calls)
+    if arguments.growth:
+        found = [node for node in leaves(shape.tree.root) if isinstance(node, ModelLeaf)]
+        growth(found[0], arguments.count // 4, 2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+"""What is proven of a compiled tree: maps of leaves, band tables, enclosures of strips, boxes and straight edges."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hhsr.compiled.edges import straight_edges
+from hhsr.compiled.records import Owner, Records
+from hhsr.kernels import layout as at
+from hhsr.kernels import slab as slab_at
+from hhsr.kernels.crossing import first_exits
+from hhsr.kernels.maps import build_map, pyramid_size
+from hhsr.kernels.region_box import leaf_box, part_box
+from hhsr.kernels.slab_bounds import fill_lobe_spheres
+from hhsr.model import Cut, FloatArray, ModelLeaf, RetainedPart, rotation_matrix
+
+BandTables = tuple[tuple[tuple[FloatArray, FloatArray], ...], ...]
+
+
+class Proofs(Records):
+    """The steps that fill what is proven, in the order in which one needs the other."""
+
+    def fill_map(self, blob: FloatArray, blob_view: FloatArray, owner: Owner) -> None:
+        """Prove the bounds of one leaf."""
+        ints = blob.view(np.int64)
+        record = ints[owner.record : owner.record + at.LEAF_INT_SIZE]
+        tables = blob[ints[at.MAP_START] :].view(np.float32)
+        n = int(record[at.CELLS])
+        size = pyramid_size(n)
+        cells, ranges, spheres = (int(record[k]) for k in (at.CELL_TABLE, at.RANGE_TABLE, at.SPHERE_TABLE))
+        box = int(record[at.BOX])
+        build_map(
+            blob_view,
+            owner.record,
+            n,
+            tables[cells : cells + 6 * n * n * at.CELL_SIZE].reshape(6, n, n, at.CELL_SIZE),
+            tables[ranges : ranges + 2 * size].reshape(size, 2),
+            tables[spheres : spheres + 4 * size].reshape(size, 4),
+            blob[box : box + 8],
+        )
+
+    def fill_bands(self, blob: FloatArray, blob_view: FloatArray) -> BandTables:
+        """Fill L and R of every lobe, the deepest cuts first: a child's section already has its own bands."""
+        angles = -math.pi + 2.0 * math.pi * np.arange(slab_at.TABLE) / slab_at.TABLE
+        found: dict[int, list[tuple[FloatArray, FloatArray]]] = {}
+        reach = self._reach(blob)
+        for cut, node, _ in reversed(self.cuts):
+            found[node] = []
+            if node not in self.slab_records:
+                continue
+            e1, e2, n = cut.frame
+            rays = reach * (np.cos(angles)[:, None] * e1 + np.sin(angles)[:, None] * e2)
+            for contour, start in zip(cut.contours, self.slab_records[node][1], strict=True):
+                pair = []
+                for side, child in ((-1.0, self.nodes[node][1]), (1.0, self.nodes[node][2])):
+                    centre = contour.centre[0] * e1 + contour.centre[1] * e2 + (cut.offset + side * cut.half_width) * n
+                    shares = np.empty(slab_at.TABLE)
+                    first_exits(blob_view, child, centre, rays, 1e-3, 1e-6, shares)
+                    pair.append(shares * reach)
+                    o = start + 2 + (0 if side < 0 else slab_at.TABLE + 1)
+                    blob[o : o + slab_at.TABLE] = pair[-1]
+                    blob[o + slab_at.TABLE] = pair[-1][0]
+                found[node].append((pair[0], pair[1]))
+            self._fill_strips(blob, blob_view, node)
+        return tuple(tuple(found[node]) for _, node, _ in self.cuts)
+
+    def _fill_strips(self, blob: FloatArray, blob_view: FloatArray, node: int) -> None:
+        """Prove the enclosures of a slab's strips."""
+        ints = blob_view.view(np.int64)
+        slab = self.owners[self.nodes[node][3]].record
+        lobes_at, starts = self.slab_records[node]
+        for k in range(len(starts)):
+            lobe = lobes_at + slab_at.LOBE_INT_SIZE * k
+            spheres = int(ints[lobe + slab_at.LOBE_SPHERES])
+            out = blob[spheres : spheres + 6 * slab_at.TABLE].reshape(slab_at.TABLE, 6)
+            fill_lobe_spheres(blob_view, ints, slab, lobe, out)
+
+    def _reach(self, blob: FloatArray) -> float:
+        """Return a length (mm) that no straight line within the solid can reach."""
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        ints = blob.view(np.int64)
+        for owner in self.owners:
+            if isinstance(owner.source, ModelLeaf):
+                box = int(ints[owner.record + at.BOX])
+                far = math.sqrt(3.0) * blob[box + 7]
+                low, high = np.minimum(low, owner.source.centre - far), np.maximum(high, owner.source.centre + far)
+            elif isinstance(owner.source, RetainedPart) and len(owner.source.faces):
+                low = np.minimum(low, owner.source.vertices.min(axis=0))
+                high = np.maximum(high, owner.source.vertices.max(axis=0))
+        for cut, _, _ in self.cuts:  # a lobe may reach beyond every leaf
+            for contour in cut.contours:
+                centre = cut.frame.T @ np.array([*contour.centre, cut.offset])
+                far = 3.0 * 10.0 * float(contour.half_axes.max()) + cut.half_width
+                low, high = np.minimum(low, centre - far), np.maximum(high, centre + far)
+        return 2.0 * float(np.linalg.norm(high - low)) + 1.0 if np.isfinite(low).all() else 1.0
+
+    def fill_boxes(self, blob: FloatArray, blob_view: FloatArray) -> None:
+        """Fill each owner's box: its surface within its region, tree frame."""
+        for owner in self.owners:
+            blob[owner.box_at : owner.box_at + 6] = self._owner_box(blob_view, owner, np.eye(3), np.zeros(3))
+
+    def _owner_box(self, blob_view: FloatArray, owner: Owner, rotation: FloatArray, shift: FloatArray) -> FloatArray:
+        box = np.empty(6)
+        if isinstance(owner.source, ModelLeaf):
+            own = rotation @ rotation_matrix(owner.source.rotation)
+            leaf_box(blob_view, owner.record, owner.planes_at, len(owner.planes), own, box)
+            return box + np.tile(rotation @ owner.source.centre + shift, 2)
+        if isinstance(owner.source, RetainedPart):
+            part_box(blob_view, owner.record, owner.planes_at, len(owner.planes), np.ascontiguousarray(rotation), box)
+            return box + np.tile(shift, 2)
+        return self._slab_box(blob_view, owner.source, owner.node, rotation, shift)
+
+    def _slab_box(
+        self, blob_view: FloatArray, cut: Cut, node: int, rotation: FloatArray, shift: FloatArray
+    ) -> FloatArray:
+        ints = blob_view.view(np.int64)
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        lobes_at, starts = self.slab_records[node]
+        for k in range(len(starts)):
+            o = int(ints[lobes_at + slab_at.LOBE_INT_SIZE * k + slab_at.LOBE_SPHERES])
+            spheres = blob_view[o : o + 6 * slab_at.TABLE].reshape(-1, 6)
+            spheres = spheres[spheres[:, 5] > 0.0]
+            if len(spheres):
+                centres = spheres[:, :3] @ rotation.T + shift
+                low = np.minimum(low, (centres - spheres[:, 3:4]).min(axis=0))
+                high = np.maximum(high, (centres + spheres[:, 3:4]).max(axis=0))
+        return np.concatenate([low, high])
+
+    def fill_edges(self, blob: FloatArray, blob_view: FloatArray) -> None:
+        """Find the straight edges of the surface."""
+        low, high = _union([blob_view[o.box_at : o.box_at + 6] for o in self.owners])
+        middle = 0.5 * (low + high) if np.isfinite(low).all() else np.zeros(3)
+        cuts = [(cut, planes) for cut, _, planes in self.cuts]
+        edges = straight_edges(blob_view, cuts, middle, self._reach(blob))[: self.most_edges]
+        head = self.header(blob)
+        head[at.EDGE_COUNT] = len(edges)
+        start = int(head[at.EDGE_FLOATS])
+        for k, edge in enumerate(edges):
+            blob[start + 6 * k : start + 6 * k + 6] = edge
+
+    def bounds(self, blob_view: FloatArray, rotation: FloatArray, shift: FloatArray) -> FloatArray:
+        """Return (2, 3) the box of the solid after a rigid motion: of its patches and straight edges."""
+        boxes = [self._owner_box(blob_view, o, rotation, shift) for o in self.owners]
+        head = self.header(blob_view)
+        start, count = int(head[at.EDGE_FLOATS]), int(head[at.EDGE_COUNT])
+        ends = blob_view[start : start + 6 * count].reshape(-1, 3) @ rotation.T + shift
+        boxes.extend(np.concatenate([p, p]) for p in ends)
+        low, high = _union(boxes)
+        return np.array([low, high]) if np.isfinite(low).all() else np.full((2, 3), np.nan)
+
+
+def _union(boxes: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for box in boxes:
+        if box[0] <= box[3]:
+            low, high = np.minimum(low, box[:3]), np.maximum(high, box[3:])
+    return low, high
