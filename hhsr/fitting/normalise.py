@@ -8,9 +8,10 @@ from scipy.spatial.transform import Rotation
 from hhsr.errors import SurfaceError
 from hhsr.model import FloatArray, IntArray, rotation_matrix
 
-# The vertices are carried over by the pose as stored, so its rounding moves nothing: it only shortens the file.
-ROTATION_STEP = 2.0**-16
-SHIFT_STEP_SHARE = 2.0**-14
+# The vertices are carried over by the pose as stored, so its rounding moves nothing. It is fine enough that the same
+# source elsewhere is the same to 1e-5 of a mm: with 1e-3, greedy choices fell differently and the error by up to 12 %.
+ROTATION_STEP = 2.0**-22
+SHIFT_STEP_SHARE = 2.0**-22
 
 
 def normalise(vertices: FloatArray, faces: IntArray | None) -> tuple[FloatArray, FloatArray]:
