@@ -32,7 +32,7 @@ from hhsr.shape import Shape
 X, Y, Z = np.eye(3)
 POSE = np.array([0.3, -0.2, 0.5, 7.0, -3.0, 2.0])
 GRID = CentreGrid((30, 120), 2.0)
-FINE = CentreGrid((600,), 2.0)
+FINE = CentreGrid((2000,), 2.0)
 CUBE = np.array([[x, y, z] for x in (-5.0, 5.0) for y in (-5.0, 5.0) for z in (-5.0, 5.0)])
 QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 CUBE_FACES = np.array([f for a, b, c, d in QUADS for f in ((a, b, c), (a, c, d))])
@@ -63,7 +63,7 @@ def pitted() -> ModelLeaf:
     """Return a leaf with a pit so deep that its scale field is capped, and knots that make an edge."""
     base = Superquadric(frozen([10.0] * 6), frozen([-2.5]), frozen([-2.5]))
     return ModelLeaf(
-        frozen([0.0, 0.0, 0.0]), frozen([]), base, ScaleField(FINE, frozen([130], np.int64), frozen([2.0]))
+        frozen([0.0, 0.0, 0.0]), frozen([]), base, ScaleField(FINE, frozen([430], np.int64), frozen([2.0]))
     )
 
 
