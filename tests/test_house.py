@@ -76,6 +76,7 @@ def test_every_imported_package_is_declared() -> None:
         "mpl_toolkits": "matplotlib",
         "igl": "libigl",
         "DracoPy": "dracopy",
+        "distributed": "dask",
     }
     import sys
 
