@@ -97,13 +97,15 @@ def test_what_no_point_sees_is_cut_and_no_void_opens_at_the_cuts() -> None:
     assert disagreement(node, vertices, faces, deeper=1.0) < 0.005
 
 
-def test_two_bodies_become_two_leaves() -> None:
+def test_two_bodies_are_parted() -> None:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
     vertices = np.vstack([ball.vertices, np.array(ball.vertices) + np.array([40.0, 3.0, 0.0])])
     faces = np.vstack([ball.faces, ball.faces + len(ball.vertices)])
     vertices = normalise(vertices, faces)[0]
     node = fit_default(vertices, faces, FitOptions(max_parameters=60))
-    assert len(list(leaves(node))) == 2
+    # A third leaf may pay on the facets of the balls; one leaf over both bodies cannot.
+    assert len(list(leaves(node))) >= 2
+    assert misses(node, vertices, faces).mean() < 0.1
     assert disagreement(node, vertices, faces) < 0.02
 
 
