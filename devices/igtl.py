@@ -136,6 +136,11 @@ class IgtlTracker(Tracker):
         """Whether a lost connection is made again: always."""
         return True
 
+    @property
+    def is_live(self) -> bool:
+        """Whether frames should be read at once: arrival times tell when."""
+        return True
+
     def _start(self) -> None:
         self._open()
 

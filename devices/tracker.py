@@ -76,6 +76,11 @@ class Tracker(ABC):
         """Whether `read` after a `TransportError` tries to find the device again."""
         return False
 
+    @property
+    def is_live(self) -> bool:
+        """Whether a device is behind it whose frames are lost, or wrongly timed, when they are read late."""
+        return False
+
     def now_s(self) -> float:
         """Return the present on the clock of `arrival_s` (a replay has its own), s."""
         return self.clock.now_s()

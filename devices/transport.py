@@ -133,7 +133,9 @@ class SerialLine(Line):
     def drop_input(self) -> None:
         """Forget what has come and was not read."""
         try:
-            self._opened().reset_input_buffer()
+            port = self._opened()
+            if port.in_waiting:  # asking is quicker than flushing, and this runs before every question
+                port.reset_input_buffer()
         except TransportError:
             raise
         except Exception as error:  # termios.error is no OSError

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 
@@ -116,6 +117,12 @@ class Device:
     def frame_index(self) -> int:
         """Frames since tracking started."""
         return int((self.clock.now_s() - self._started_s) * self.rate_hz + 1e-9)
+
+    def next_frame_s(self) -> float:
+        """Time until the next frame, s; infinite where the device does not track."""
+        if not self.tracking:
+            return math.inf
+        return self._started_s + (self.frame_index() + 1) / self.rate_hz - self.clock.now_s()
 
     def frame_number(self, index: int) -> int:
         """Device number of a frame, 32 bits."""

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
-import pty
 import select
 import socket
 import struct
-import termios
 import threading
-import tty
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Self, TypeVar
 
+from devices.clock import SystemClock
 from devices.errors import DeviceInputError, TransportError
 from devices.ndi.device import Device
 from devices.ndi.faults import Faults
+from devices.ndi.pace import PacedClock
+from devices.scheduling import hurry_this_thread
 
 __all__ = ["Emulator", "PtyEmulator", "TcpEmulator"]
 
@@ -27,6 +27,10 @@ _POLL_S = 0.05
 _TRACKING = (b"TX", b"BX")
 #: a device that lost its cable is back after this, s
 _PLUG_S = 0.3
+# what the kernel says in front of each packet of a pseudo-terminal in packet mode, the same on Linux and macOS
+_DATA, _FLUSHED_BOTH = 0x00, 0x03
+
+Waited = TypeVar("Waited", int, socket.socket)
 
 
 class Disconnected(Exception):
@@ -35,6 +39,9 @@ class Disconnected(Exception):
 
 class Emulator(ABC):
     """Serve a `Device` on a line, on a thread of its own, until `stop`.
+
+    The thread asks to be run before others, and a device in real time gets a `PacedClock`: what holds the emulator up
+    makes frames late, but skips none.
 
     Parameters
     ----------
@@ -47,6 +54,9 @@ class Emulator(ABC):
         self.faults = Faults() if faults is None else faults
         if self.faults.wrap:
             self.device.first_frame = 2**32 - 120
+        if isinstance(self.device.clock, SystemClock):
+            self.device.clock = PacedClock(self.device.clock)
+        self._meant_s = 0.0
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -97,11 +107,36 @@ class Emulator(ABC):
         self.stop()
 
     def _run(self) -> None:
+        hurry_this_thread()
         while not self._stopping.is_set():
             try:
                 self._serve()
             except Disconnected:
                 self._hang_up()
+
+    def _ready(self, lines: Sequence[Waited]) -> list[Waited]:
+        """Wait a moment, at most until the next frame is due, for lines that can be read.
+
+        A loop that was held up answers first, for the time when it should have woken: the question may be that old.
+        """
+        clock = self.device.clock
+        if not isinstance(clock, PacedClock):
+            return select.select(lines, [], [], _POLL_S)[0]
+        self._turn(clock)
+        self._meant_s = min(_POLL_S, clock.real_s(max(0.0, self.device.next_frame_s())))
+        ready = select.select(lines, [], [], self._meant_s)[0]
+        if not (ready and self.device.tracking and clock.is_held_up(self._meant_s)):
+            self._turn(clock)
+        return ready
+
+    def _turn(self, clock: PacedClock) -> None:
+        clock.turn(self._meant_s)
+        self._meant_s = 0.0
+
+    def _pause(self, time_s: float) -> None:
+        """Let the device do nothing for a while; its frames go on."""
+        clock = self.device.clock
+        clock.wait_until(clock.now_s() + time_s, self._stopping)
 
     def _answer(self, data: bytes, write_line: int | socket.socket) -> None:
         """Answer what came in, with whatever the faults make of it."""
@@ -113,7 +148,7 @@ class Emulator(ABC):
                     self.device.out_of_volume ^= {0}
             for delivery in self.faults.deliver(reply, due):
                 if delivery.delay_s > 0.0:
-                    self._stopping.wait(delivery.delay_s)
+                    self._pause(delivery.delay_s)
                 if delivery.disconnect:
                     raise Disconnected
                 self._write(write_line, delivery.data)
@@ -171,6 +206,15 @@ class PtyEmulator(Emulator):
         return f"ndi:{self.path}"
 
     def _listen(self) -> None:
+        try:
+            import fcntl
+            import pty
+            import termios
+            import tty
+        except ImportError as error:
+            raise DeviceInputError(
+                f"this system has no pseudo-terminals ({error}): emulate on a TCP port instead (--tcp, TcpEmulator)"
+            ) from error
         self._master, self._slave = pty.openpty()
         # raw, or the terminal would echo; the slave stays open here, or reads fail whenever no client has it open
         tty.setraw(self._slave)
@@ -185,7 +229,7 @@ class PtyEmulator(Emulator):
                 raise DeviceInputError(f"{self.link}: cannot be made a link to {self._terminal}: {error}") from error
 
     def _serve(self) -> None:
-        ready = select.select([self._master], [], [], _POLL_S)[0]
+        ready = self._ready([self._master])
         now_s = self.device.clock.now_s()
         if not ready:
             if self._flushed_s is not None and now_s - self._flushed_s >= self._BREAK_S:
@@ -202,17 +246,17 @@ class PtyEmulator(Emulator):
                 return
             raise
         kind = packet[0]
-        if kind == termios.TIOCPKT_DATA:
+        if kind == _DATA:
             self._flushed_s = None
             self._answer(packet[1:], self._master)
-        elif kind & termios.TIOCPKT_FLUSHREAD and kind & termios.TIOCPKT_FLUSHWRITE:
+        elif kind & _FLUSHED_BOTH == _FLUSHED_BOTH:
             self._flushed_s = now_s
 
     def _hang_up(self) -> None:
         self._close()
         self.device.reset()
         self._partial = b""
-        self._stopping.wait(_PLUG_S)
+        self._pause(_PLUG_S)
         if not self._stopping.is_set():
             self._listen()
 
@@ -261,7 +305,7 @@ class TcpEmulator(Emulator):
         listener, client = self._listener, self._client
         assert listener is not None
         waiting = [listener] if client is None else [listener, client]
-        for ready in select.select(waiting, [], [], _POLL_S)[0]:
+        for ready in self._ready(waiting):
             if ready is listener:
                 self._drop()
                 self._client, _ = listener.accept()

@@ -17,7 +17,7 @@ from devices.ndi.replies import Option, PoseReport, tool_pose
 from devices.ndi.rom import read_rom
 from devices.ndi.session import Interrupted, Session, SilentLine
 from devices.ndi.text_replies import decode_tx
-from devices.timing import ClockLine
+from devices.timing import ClockLine, warm_up
 from devices.tracker import Tracker
 from devices.transport import Line, SerialLine, TcpLine
 
@@ -127,6 +127,7 @@ class NdiTracker(Tracker):
         self._tracking = False
         self._silent = self._refused = self._behind = 0
         self._last_raw = -1
+        self._last_reply: str | bytes = b""
         self._queue: deque[TrackerFrame] = deque()
         self._number: int | None = None
         self._clock_line = ClockLine()
@@ -147,10 +148,16 @@ class NdiTracker(Tracker):
         """Whether a lost line is looked for again: always."""
         return True
 
+    @property
+    def is_live(self) -> bool:
+        """Whether frames that are read late are lost: a device keeps its newest frame only."""
+        return True
+
     # start and stop
 
     def _start(self) -> None:
         self._number = None
+        warm_up()
         with self._lock:
             self._connect()
 
@@ -204,6 +211,7 @@ class NdiTracker(Tracker):
         self._tracking = True
         self._silent = self._refused = self._behind = 0
         self._last_raw = -1
+        self._last_reply = b""
         self._clock_line = ClockLine()
 
     # reading
@@ -265,6 +273,10 @@ class NdiTracker(Tracker):
             kind = wanted.get(self._options & (Option.TOOL_MARKERS | Option.STRAYS), "all")
             arguments = f"--6d=tools --3d={kind} --1d=buttons"
         reply = self._session.ask(self.mode, arguments, self._reply_timeout_s)
+        if reply == self._last_reply:  # as most are: no newer frame, and nothing in it to decode
+            self.counters.repeated += self.mode != "BX2"
+            return []
+        self._last_reply = reply
         try:
             if self.mode == "TX" and isinstance(reply, str):
                 return [decode_tx(reply, self._options)]
