@@ -46,10 +46,10 @@ _STATUS_CODE = {
 
 def _received_pose(message: Message, T: NDArray[np.float64]) -> ToolPose:
     """A pose that came is OK only where it is rigid and finite, and the sender does not say otherwise."""
-    said = (value for key, value in message.metadata.items() if key.lower().endswith("status"))
-    if any(value.upper() != "OK" for value in said) or not is_rigid(T):
-        return ToolPose(ToolStatus.INVALID, None)
-    return ToolPose(ToolStatus.OK, T)
+    for key, value in message.metadata.items():
+        if key.lower().endswith("status") and value.upper() != "OK":
+            return ToolPose(ToolStatus.INVALID, None)
+    return ToolPose(ToolStatus.OK, T) if is_rigid(T) else ToolPose(ToolStatus.INVALID, None)
 
 
 class _Groups:

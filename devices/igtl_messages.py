@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -163,12 +164,16 @@ class MessageReader:
             except ProtocolError as error:
                 done.append(error)
                 continue
-            done.append(Message(_text(kind), _text(name), seconds + fraction / 2**32, content, metadata))
+            done.append(Message(_label(kind), _label(name), seconds + fraction / 2**32, content, metadata))
         return done
 
 
 def _text(field_bytes: bytes) -> str:
     return field_bytes.split(b"\0")[0].decode("utf-8", "replace").strip()
+
+
+#: the same few kinds and names come all the time
+_label = lru_cache(1024)(_text)
 
 
 def _unwrapped(version: int, body: bytes) -> tuple[bytes, dict[str, str]]:
@@ -251,9 +256,8 @@ def decode_status(content: bytes) -> Status:
 
 
 def _matrix(values: tuple[float, ...]) -> Array:
-    T = np.eye(4)
-    T[:3] = np.reshape(values, (4, 3)).T
-    return T
+    a, d, g, b, e, h, c, f, i, x, y, z = values  # column by column
+    return np.array(((a, b, c, x), (d, e, f, y), (g, h, i, z), (0.0, 0.0, 0.0, 1.0)))
 
 
 def decode_poses(message: Message) -> dict[str, Array]:

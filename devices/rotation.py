@@ -39,14 +39,16 @@ def is_rigid(T: object, tolerance: float = 1e-3) -> bool:
     (a, b, c, x), (d, e, f, y), (g, h, i, z), last = matrix.tolist()
     if last != [0.0, 0.0, 0.0, 1.0] or not math.isfinite(x + y + z):
         return False
-    lengths = (a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i)
-    angles = (a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i)
     # written so that a NaN fails
-    if not all(abs(length - 1.0) <= tolerance for length in lengths):
-        return False
-    if not all(abs(angle) <= tolerance for angle in angles):
-        return False
-    return bool(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0)
+    return bool(
+        abs(a * a + b * b + c * c - 1.0) <= tolerance
+        and abs(d * d + e * e + f * f - 1.0) <= tolerance
+        and abs(g * g + h * h + i * i - 1.0) <= tolerance
+        and abs(a * d + b * e + c * f) <= tolerance
+        and abs(a * g + b * h + c * i) <= tolerance
+        and abs(d * g + e * h + f * i) <= tolerance
+        and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0
+    )
 
 
 def rotation_from_quaternion(quaternion: ArrayLike) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ from typing import Self
 
 from devices.errors import DeviceError, TransportError
 from devices.frame import TrackerFrame
-from devices.scheduling import AS_ANY_OTHER, hurry_this_thread
+from devices.scheduling import AS_ANY_OTHER, hurried_thread
 from devices.tracker import Tracker
 
 __all__ = ["Stream", "StreamCounters"]
@@ -68,7 +68,8 @@ class Stream:
     number_step : int
         How far the device's frame number moves from one frame to the next (a tracker at 20 Hz may count at 60 Hz).
     hurry : bool
-        False leaves the reader thread of a live tracker scheduled as any other.
+        False leaves the reader thread of a live tracker scheduled as any other, and Python's switch interval alone
+        (see `devices.scheduling`).
 
     Notes
     -----
@@ -216,24 +217,29 @@ class Stream:
     # the reader thread
 
     def _run(self) -> None:
-        if self._hurry and self.tracker.is_live:
-            self.scheduling = hurry_this_thread()
         try:
-            while not self._stopping.is_set() and not self.tracker.is_finished:
-                try:
-                    frame = self.tracker.read(_POLL_S)
-                except TransportError as error:
-                    self._hand_over(error)
-                    if not self.tracker.reconnects:
-                        return
-                    self._stopping.wait(_RETRY_S)
-                    continue
-                if frame is not None:
-                    self._accept(frame)
+            if self._hurry and self.tracker.is_live:
+                with hurried_thread() as self.scheduling:
+                    self._read_on()
+            else:
+                self._read_on()
         except BaseException as error:  # every error of this thread belongs to the caller
             self._hand_over(error)
         finally:
             self._end()
+
+    def _read_on(self) -> None:
+        while not self._stopping.is_set() and not self.tracker.is_finished:
+            try:
+                frame = self.tracker.read(_POLL_S)
+            except TransportError as error:
+                self._hand_over(error)
+                if not self.tracker.reconnects:
+                    return
+                self._stopping.wait(_RETRY_S)
+                continue
+            if frame is not None:
+                self._accept(frame)
 
     def _hand_over(self, error: BaseException) -> None:
         if self._stopping.is_set() and isinstance(error, DeviceError):

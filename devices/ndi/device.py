@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from fnmatch import fnmatchcase
 
 from devices.clock import Clock, SystemClock
 from devices.errors import DeviceInputError
@@ -33,6 +34,7 @@ _ANY_TIME = {"INIT", "RESET", "COMM", "VER", "ECHO", "APIREV", "BEEP", "GET", "G
 _NOT_TRACKING = {"INIT", "COMM", "PHSR", "PHRQ", "PVWR", "PVCLR", "PINIT", "PENA", "PDIS", "PHF", "PHINF", "TSTART"}
 _NOT_TRACKING |= {"SSTAT", "VSEL", "DSTART", "DSTOP", "SFLIST", "VER"}
 _LONGEST_COMMAND = 4096
+_KNOWS_BX2 = "G.003"
 #: a tool was plugged in or pulled out; told until the host asks which
 _PORTS_CHANGED = 0xC0
 
@@ -99,6 +101,7 @@ class Device:
             "Features.Hardware.Serial Number": "E0-00000",
         }
         self._buffer = bytearray()
+        self._too_long = False
         self.reset()
         self.resets = 0
 
@@ -109,7 +112,7 @@ class Device:
         self.ports = Ports([self.bodies.name(k) for k in range(len(self.bodies))] if self._wired else [])
         self._started_s = 0.0
         self._told: int | None = None
-        self._buffer.clear()
+        self.forget_input()
         self.resets += 1
 
     # frames
@@ -152,16 +155,31 @@ class Device:
 
     def receive(self, data: bytes) -> list[bytes]:
         """Take bytes of the line; return a reply for every command that they complete."""
-        self._buffer += data
-        replies = []
-        while (end := self._buffer.find(b"\r")) >= 0:
-            message = bytes(self._buffer[:end])
-            del self._buffer[: end + 1]
-            replies.append(self.answer(message.lstrip(b"\n")))
+        return [reply for _, reply in self.exchanges(data)]
+
+    def exchanges(self, data: bytes) -> list[tuple[bytes, bytes]]:
+        """Take bytes of the line, cut anywhere; return (command, reply) for every command that they complete.
+
+        A command may end with a carriage return, or with a line feed behind it. One that is too long is refused once,
+        at its end; nothing of it is kept.
+        """
+        done = []
+        *whole, rest = data.split(b"\r")
+        for piece in whole:
+            message = (bytes(self._buffer) + piece).lstrip(b"\n")
+            too_long = self._too_long or len(message) > _LONGEST_COMMAND
+            self.forget_input()
+            done.append((message, text_reply("ERROR02") if too_long else self.answer(message)))
+        self._buffer += rest
         if len(self._buffer) > _LONGEST_COMMAND:
-            self._buffer.clear()
-            replies.append(text_reply("ERROR02"))
-        return replies
+            self.forget_input()
+            self._too_long = True
+        return done
+
+    def forget_input(self) -> None:
+        """Forget a command that is not complete: the line was cut."""
+        self._buffer.clear()
+        self._too_long = False
 
     def answer(self, message: bytes) -> bytes:
         """Answer one command, given without its carriage return."""
@@ -198,7 +216,7 @@ class Device:
             return name, rest[1:].strip(" ") if name != "ECHO" else rest[1:]
         if len(rest) < 5:
             raise Refused(0x03)
-        if f"{crc16(message[:-4]):04X}" != rest[-4:]:
+        if f"{crc16(message[:-4]):04X}" != rest[-4:].upper():
             raise Refused(0x04)
         return name, rest[1:-4]
 
@@ -221,12 +239,15 @@ class Device:
         part = {"0": "Control", "3": "Tool", "4": "Enhanced", "5": "Combined"}.get(arguments.lstrip("0") or "0")
         if part is None:
             raise Refused(0x23)
-        lines = [f"Emulated Tracker {part} Firmware", "NDI S/N: E0-00000", "Freeze Tag: Emulator Rev 001.000"]
+        # clients choose between TX and BX by this line, so it names a device that is like this one
+        like = "Polaris Vega 008" if self.api_revision >= _KNOWS_BX2 else "Polaris Spectra Rev 007"
+        lines = [f"Emulated Tracker {part} Firmware", "NDI S/N: E0-00000", f"Freeze Tag: {like}"]
         return "\n".join([*lines, "Freeze Date: 01/01/26", ""])
 
     def _get(self, arguments: str) -> str:
-        pattern = re.compile(re.escape(arguments).replace(r"\*", ".*"))
-        lines = [f"{name}={value}\n" for name, value in sorted(self.settings.items()) if pattern.fullmatch(name)]
+        # only the star is special; a regular expression of many stars would take for ever
+        pattern = arguments.replace("[", "[[]").replace("?", "[?]")
+        lines = [f"{name}={value}\n" for name, value in sorted(self.settings.items()) if fnmatchcase(name, pattern)]
         if not lines:
             raise Refused(0x34)
         return "".join(lines)
@@ -283,7 +304,7 @@ class Device:
         return binary_reply(bx_body(self._seen(index), options, self._strays(index), self.system_status))
 
     def _bx2(self, arguments: str) -> bytes:
-        if self.api_revision < "G.003":
+        if self.api_revision < _KNOWS_BX2:
             raise Refused(0x01)
         self._must_track()
         options = dict(re.findall(r"--(\w+)=(\w+)", arguments))
@@ -308,6 +329,12 @@ class Device:
     def _echo(self, arguments: str) -> str:
         return arguments
 
+    def _system_status(self, arguments: str) -> str:
+        """SSTAT: two digits for each part that is asked after; nothing is ever broken here."""
+        if not re.fullmatch(r"[0-9A-Fa-f]{4}", arguments):
+            raise Refused(0x14)
+        return "00" * int(arguments, 16).bit_count()
+
     def _accept(self, arguments: str) -> str:
         return OKAY
 
@@ -329,6 +356,7 @@ _COMMANDS: dict[str, Callable[[Device, str], str | bytes]] = {
     "RESET": Device._reset,
     "SET": Device._set,
     "SFLIST": Device._features,
+    "SSTAT": Device._system_status,
     "TSTART": Device._start,
     "TSTOP": Device._stop,
     "TX": Device._tx,

@@ -140,7 +140,7 @@ class Emulator(ABC):
 
     def _answer(self, data: bytes, write_line: int | socket.socket) -> None:
         """Answer what came in, with whatever the faults make of it."""
-        for message, reply in self._replies(data):
+        for message, reply in self.device.exchanges(data):
             due = False
             if message.startswith(_TRACKING) and self.device.tracking:
                 due = self.faults.moment()
@@ -152,13 +152,6 @@ class Emulator(ABC):
                 if delivery.disconnect:
                     raise Disconnected
                 self._write(write_line, delivery.data)
-
-    def _replies(self, data: bytes) -> list[tuple[bytes, bytes]]:
-        *whole, rest = (self._partial + data).split(b"\r")
-        self._partial = rest
-        return [(message.lstrip(b"\n"), reply) for message in whole for reply in self.device.receive(message + b"\r")]
-
-    _partial = b""
 
     def _write(self, line: int | socket.socket, data: bytes) -> None:
         view = memoryview(data)
@@ -235,7 +228,6 @@ class PtyEmulator(Emulator):
             if self._flushed_s is not None and now_s - self._flushed_s >= self._BREAK_S:
                 self._flushed_s = None
                 self.device.reset()
-                self._partial = b""
                 self._answer(b"RESET\r", self._master)
             return
         try:
@@ -255,7 +247,6 @@ class PtyEmulator(Emulator):
     def _hang_up(self) -> None:
         self._close()
         self.device.reset()
-        self._partial = b""
         self._pause(_PLUG_S)
         if not self._stopping.is_set():
             self._listen()
@@ -322,7 +313,7 @@ class TcpEmulator(Emulator):
             self._answer(data, ready)
 
     def _drop(self) -> None:
-        self._partial = b""
+        self.device.forget_input()
         if self._client is not None:
             self._client.close()
             self._client = None

@@ -65,10 +65,10 @@ class Ports:
 
     def get(self, text: str) -> Port:
         """Port of a handle given in hexadecimal."""
+        if not re.fullmatch(r"[0-9A-Fa-f]{2}", text):
+            raise Refused(0x08)
         try:
             return self.handles[int(text, 16)]
-        except ValueError:
-            raise Refused(0x08) from None
         except KeyError:
             raise Refused(0x2B) from None
 
@@ -104,10 +104,9 @@ class Ports:
         port = self.get(arguments[:2])
         if len(arguments) != 2 + 4 + 128:
             raise Refused(0x03 if len(arguments) < 134 else 0x02)
-        try:
-            address, piece = int(arguments[2:6], 16), bytes.fromhex(arguments[6:])
-        except ValueError:
-            raise Refused(0x14) from None
+        if not re.fullmatch(r"[0-9A-Fa-f]{132}", arguments[2:]):
+            raise Refused(0x14)
+        address, piece = int(arguments[2:6], 16), bytes.fromhex(arguments[6:])
         if address + 64 > 1024:
             raise Refused(0x23)
         port.memory.extend(bytes(max(0, address + 64 - len(port.memory))))
@@ -162,10 +161,9 @@ class Ports:
     def information(self, arguments: str) -> str:
         """PHINF: fields of fixed width, as many as asked for."""
         port = self.get(arguments[:2])
-        try:
-            wanted = int(arguments[2:] or "1", 16)
-        except ValueError:
-            raise Refused(0x14) from None
+        if not re.fullmatch(r"[0-9A-Fa-f]{4}|", arguments[2:]):
+            raise Refused(0x14)
+        wanted = int(arguments[2:] or "1", 16)
         if not port.occupied:
             return "UNOCCUPIED"
         name = port.definition.manufacturer if port.definition else "EMULATOR"

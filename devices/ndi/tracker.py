@@ -133,6 +133,7 @@ class NdiTracker(Tracker):
         self._clock_line = ClockLine()
         self._next_poll_s = self._plugged_s = self._new_s = -np.inf
         self._period_s = 1.0 / 60.0
+        self._slow_s = 0.0
         #: reply in use, and the system status and alerts of the last one
         self.mode = mode
         self.system_status = 0
@@ -242,6 +243,7 @@ class NdiTracker(Tracker):
         """Ask once, unless a frame of the last reply waits; None where there is nothing new or nothing whole."""
         if self._queue:
             return self._queue.popleft()
+        due_s = max(self._next_poll_s, self.clock.now_s())
         self.clock.wait_until(self._next_poll_s, self._stopping)
         try:
             reports = self._ask()
@@ -259,6 +261,7 @@ class NdiTracker(Tracker):
             return None
         self._silent = self._refused = 0
         arrival_s = self.clock.now_s()
+        self._slow_s = max(arrival_s - due_s, 0.98 * self._slow_s)
         frames = [self._frame(report, arrival_s) for report in reports]
         self._queue.extend(frame for frame in frames if frame is not None)
         self._plan_next(arrival_s, bool(self._queue))
@@ -304,8 +307,9 @@ class NdiTracker(Tracker):
             raise error
 
     def _plan_next(self, arrival_s: float, new: bool) -> None:
-        """Ask again half a frame later, and where nothing new was there, a little later: no stall must cost a frame."""
-        self._next_poll_s = arrival_s + (0.5 if new else 0.05) * self._period_s
+        """Ask again half a frame later, earlier by what waking and asking took lately; if in vain, a little later."""
+        wait_s = max(0.0, 0.5 * self._period_s - 2.0 * self._slow_s) if new else 0.05 * self._period_s
+        self._next_poll_s = arrival_s + wait_s
 
     def _plug_in(self, now_s: float) -> None:
         """A tool was plugged in: it must be initialised and enabled, which is possible only while not tracking."""
