@@ -1,11 +1,11 @@
-"""Scene files: TOML in, a checked Scene out. Every error names the key, what was got, and what to do."""
+"""Scene files: TOML in, the checked parts of a scene out. Every error names the key, what was got, and what to do."""
 
 from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from guidance.budget import ErrorBudget
 from guidance.errors import GuidanceError, SceneError
 from guidance.fitted_shapes import ShapeSource, fitted_shapes
 from guidance.needle import Array, Needle
-from guidance.scene import AVOID, Entry, Scene, Structure, Target
+from guidance.scene_parts import AVOID, Entry, Structure, Target
 
 if TYPE_CHECKING:
     from hhsr import Shape
@@ -36,7 +36,18 @@ _KEYS = {
 }
 
 
-def load_scene(path: Path, shapes: Path | None, progress: Callable[[str, Any], None] | None) -> Scene:
+class SceneParts(NamedTuple):
+    """What `Scene` is made of, in the order in which it takes them."""
+
+    name: str
+    structures: tuple[Structure, ...]
+    target: Target
+    entry: Entry
+    needle: Needle
+    errors: ErrorBudget
+
+
+def read_scene_file(path: Path, shapes: Path | None, progress: Callable[[str, Any], None] | None) -> SceneParts:
     """Read, check, fit; see `Scene.load`."""
     try:
         text = path.read_text(encoding="utf-8")
@@ -49,14 +60,14 @@ def load_scene(path: Path, shapes: Path | None, progress: Callable[[str, Any], N
     except tomllib.TOMLDecodeError as error:
         raise SceneError(f"{path} is not valid TOML: {error}") from None
     try:
-        return _scene(document, path, shapes, progress)
+        return _parts(document, path, shapes, progress)
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from None
     except GuidanceError as error:
         raise SceneError(f"{path}: {error}") from error
 
 
-def _scene(document: Table, path: Path, shapes: Path | None, progress: Callable[[str, Any], None] | None) -> Scene:
+def _parts(document: Table, path: Path, shapes: Path | None, progress: Callable[[str, Any], None] | None) -> SceneParts:
     _check_keys(document, "")
     for key in ("needle", "target", "entry", "structure"):
         if key not in document:
@@ -83,7 +94,7 @@ def _scene(document: Table, path: Path, shapes: Path | None, progress: Callable[
     structures = tuple(_structure(t, s, fitted[s.name]) for t, s in zip(tables, sources, strict=True))
     target = _target(target_table, structures)
     entry = _entry(entry_table, target)
-    return Scene(document.get("name", path.stem), structures, target, entry, needle, errors)
+    return SceneParts(document.get("name", path.stem), structures, target, entry, needle, errors)
 
 
 def _source(table: Table, folder: Path) -> ShapeSource:
