@@ -32,6 +32,8 @@ _STATE_COLOURS = {
     State.UNKNOWN: "#d9d9d9",
 }
 _PIXEL_MM = 0.5
+#: width of a letter of 8 points as a share of the width of one of the lower graphs
+_LETTER = 0.0115
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,13 +278,16 @@ def _draw_warnings(axes: Axes, scene: Scene, outcome: Outcome | None, colours: d
 
 
 def _shade(axes: Axes, times: Array, states: Sequence[State]) -> None:
+    """Colour the background by state; a word stands in it where it fits, the legend has all that occur."""
+    length = float(times[-1] - times[0])
     start = 0
     for k in range(1, len(states) + 1):
         if k == len(states) or states[k] is not states[start]:
-            end = times[k] if k < len(states) else times[-1]
+            word, end = states[start].value, times[k] if k < len(states) else times[-1]
             axes.axvspan(times[start], end, color=_STATE_COLOURS[states[start]], zorder=0)
-            if end - times[start] > 0.08 * (times[-1] - times[0]):  # else the word does not fit
-                middle = 0.5 * (times[start] + end)
+            if end - times[start] > (_LETTER * len(word) + 0.01) * length:
                 place = axes.get_xaxis_transform()
-                axes.text(middle, 0.015, states[start].value, transform=place, ha="center", fontsize=8)
+                axes.text(0.5 * (times[start] + end), 0.015, word, transform=place, ha="center", fontsize=8)
             start = k
+    for state in dict.fromkeys(states):
+        axes.plot([], [], color=_STATE_COLOURS[state], linewidth=8, label=f"state {state.value}")

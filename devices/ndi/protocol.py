@@ -187,7 +187,7 @@ class ReplyReader:
         if len(message) < 4:
             return ProtocolError(f"a reply of {len(message)} bytes has no checksum: {message!r}")
         body, stated = message[:-4], message[-4:]
-        if stated != b"%04X" % crc16(body):
+        if stated.upper() != b"%04X" % crc16(body):
             return CrcError(f"checksum {stated!r} of the reply {body[:60]!r} is wrong, expected {crc16(body):04X}")
         if not body.isascii():
             return ProtocolError(f"a text reply holds bytes that are not ASCII: {body[:60]!r}")
