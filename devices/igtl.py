@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from devices.clock import Clock, SystemClock
 from devices.errors import DeviceInputError, ProtocolError, TransportError
 from devices.frame import ToolPose, ToolStatus, TrackerFrame
+from devices.igtl_groups import MessageGroups
 from devices.igtl_messages import (
     Message,
     MessageReader,
@@ -35,6 +36,7 @@ __all__ = ["IgtlServer", "IgtlTracker"]
 DEFAULT_PORT = 18944
 _SLICE_S = 0.02
 _POSES = ("TRANSFORM", "TDATA", "POSITION", "QTRANS")
+_WANTED = frozenset((*_POSES, "STATUS"))
 _STATUS_CODE = {
     ToolStatus.MISSING: 16,
     ToolStatus.DISABLED: 15,
@@ -50,49 +52,6 @@ def _received_pose(message: Message, T: NDArray[np.float64]) -> ToolPose:
         if key.lower().endswith("status") and value.upper() != "OK":
             return ToolPose(ToolStatus.INVALID, None)
     return ToolPose(ToolStatus.OK, T) if is_rigid(T) else ToolPose(ToolStatus.INVALID, None)
-
-
-class _Groups:
-    """Gather messages of single tools into frames.
-
-    Messages with one timestamp belong together. A group is closed at once when the tools are there that came together
-    the last time, otherwise by the next timestamp, a repeated name, or a pause; so no tool waits without need.
-    """
-
-    def __init__(self) -> None:
-        self.current: dict[str, ToolPose] = {}
-        self.stamp_s = 0.0
-        self._last: set[str] = set()
-        self._late = False
-        self._last_stamp_s = 0.0
-        self._companions: dict[str, set[str]] = {}
-
-    def closes(self, name: str, stamp_s: float) -> bool:
-        """Whether a message of that name and time belongs to the next group."""
-        return bool(self.current) and (stamp_s != self.stamp_s or name in self.current)
-
-    def add(self, name: str, stamp_s: float, pose: ToolPose) -> bool:
-        """Add a tool; tell whether the group is whole."""
-        self.stamp_s = stamp_s
-        self.current[name] = pose
-        if stamp_s > 0.0 and stamp_s == self._last_stamp_s and name not in self._last:
-            # it came too late for its group: wait for it the next time
-            self._late = True
-            self._last.add(name)
-            self._companions.update(dict.fromkeys(self._last, self._last))
-            return True
-        return self._companions.get(name) == self.current.keys()
-
-    def take(self) -> tuple[dict[str, ToolPose], float, bool]:
-        """Close the group: its tools, its time, and whether it repeats the time of the last one (old data)."""
-        tools, stamp_s = self.current, self.stamp_s
-        repeated = stamp_s > 0.0 and stamp_s == self._last_stamp_s and not self._late
-        if not self._late:
-            self._last, self._last_stamp_s = set(tools), stamp_s
-            self._companions.update(dict.fromkeys(tools, self._last))
-        self._late = False
-        self.current = {}
-        return tools, stamp_s, repeated
 
 
 class IgtlTracker(Tracker):
@@ -115,8 +74,8 @@ class IgtlTracker(Tracker):
         super().__init__(clock)
         self.line = TcpLine(host, port)
         self.latency_s = latency_s
-        self._reader = MessageReader()
-        self._groups = _Groups()
+        self._reader = MessageReader(_WANTED)
+        self._groups = MessageGroups()
         self._clock_line = ClockLine()
         self._queue: deque[TrackerFrame] = deque()
         self._names: dict[str, None] = {}
@@ -146,7 +105,7 @@ class IgtlTracker(Tracker):
 
     def _open(self) -> None:
         self.line.open()
-        self._reader, self._groups, self._clock_line = MessageReader(), _Groups(), ClockLine()
+        self._reader, self._groups, self._clock_line = MessageReader(_WANTED), MessageGroups(), ClockLine()
 
     def _stop(self) -> None:
         self.line.close()

@@ -17,17 +17,22 @@ AS_ANY_OTHER = "as any other thread"
 _NICE = -10
 #: how long another Python thread may compute before a waiting one gets its turn, s
 _TURN_S = 0.0005
-_WINDOWS_HIGHEST = 2
+_WINDOWS_HIGHEST, _WINDOWS_ABOVE_NORMAL = 2, 1
 _MAC_USER_INTERACTIVE = 0x21
 
 
-def hurry_this_thread() -> str:
+def hurry_this_thread(real_time: bool = True) -> str:
     """Have the calling thread scheduled before ordinary ones, as far as this user may; return what was granted.
 
     Linux: the lowest real-time priority where the user may have one (``rtprio`` in ``limits.conf``, or root), else a
     nice value of -10 (``nice`` there). Windows and macOS: the highest class of ordinary threads. Threads that this
     one starts are ordinary again. (Short time slices, which Linux refuses nobody, were tried: on a machine with five
     busy processes for two cores 200 of 800 frames were lost with them, 22 without, none with either priority.)
+
+    Parameters
+    ----------
+    real_time : bool
+        False: no real-time priority; for threads that compute, beside the one that asks the device.
 
     Examples
     --------
@@ -40,16 +45,19 @@ def hurry_this_thread() -> str:
     """
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
-            lowest = os.sched_param(os.sched_get_priority_min(os.SCHED_RR))
-            os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, lowest)
-            return "real-time priority"
+            if real_time:
+                lowest = os.sched_param(os.sched_get_priority_min(os.SCHED_RR))
+                os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, lowest)
+                return "real-time priority"
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
             return f"nice {_NICE}"
     elif sys.platform == "win32":
         kernel = ctypes.windll.kernel32
-        if kernel.SetThreadPriority(kernel.GetCurrentThread(), _WINDOWS_HIGHEST):
-            return "highest thread priority"
+        if kernel.SetThreadPriority(
+            kernel.GetCurrentThread(), _WINDOWS_HIGHEST if real_time else _WINDOWS_ABOVE_NORMAL
+        ):
+            return "higher thread priority"
     elif sys.platform == "darwin" and not ctypes.CDLL(None).pthread_set_qos_class_self_np(_MAC_USER_INTERACTIVE, 0):
         return "user-interactive class"
     return AS_ANY_OTHER
@@ -86,7 +94,8 @@ def hurried_thread() -> Iterator[str]:
 
     Python hands over every 5 ms as a rule, and a question to a tracker takes three turns: a thread that computes in
     pure Python cost every third frame at 60 Hz, and none at 0.5 ms. The interval is one for the whole process, and
-    is set back when the last hurried thread has ended.
+    is set back when the last hurried thread has ended. A thread that holds Python's lock while the system runs another
+    process instead still keeps this one waiting: threads that compute beside it are best hurried too.
     """
     _short_turns.begin()
     try:

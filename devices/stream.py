@@ -11,7 +11,7 @@ from typing import Self
 
 from devices.errors import DeviceError, TransportError
 from devices.frame import TrackerFrame
-from devices.scheduling import AS_ANY_OTHER, hurried_thread
+from devices.scheduling import AS_ANY_OTHER, hurried_thread, hurry_this_thread
 from devices.tracker import Tracker
 
 __all__ = ["Stream", "StreamCounters"]
@@ -276,6 +276,9 @@ class Stream:
 
     def _call(self) -> None:
         assert self._on_frame is not None
+        if self._hurry and self.tracker.is_live:
+            # or the reader would wait for Python's lock whenever the system kept this thread waiting with it
+            hurry_this_thread(real_time=False)
         try:
             while True:
                 with self._condition:

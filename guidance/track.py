@@ -20,6 +20,7 @@ from devices.errors import DeviceError
 from devices.frame import ToolPose, ToolStatus, TrackerFrame
 from devices.recording import Recorder
 from devices.registry import open_tracker
+from devices.scheduling import hurry_this_thread
 from devices.stream import Stream
 from devices.tracker import Tracker
 
@@ -118,6 +119,8 @@ def track(
         with ExitStack() as stack:
             stack.enter_context(terminated_as_interrupted())
             tracker = open_tracker(url)
+            if tracker.is_live:
+                hurry_this_thread(real_time=False)  # drawing must not keep the reader waiting
             session = Session(tracker)
             recorder = None if record is None else stack.enter_context(Recorder(record, source=url))
 

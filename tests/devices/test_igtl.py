@@ -111,6 +111,52 @@ def test_version_two_with_metadata_is_read() -> None:
     np.testing.assert_allclose(decode_poses(message)["Stylus"], T, atol=1e-4)
 
 
+def by_hand(version: int, kind: bytes, name: bytes, stamp_s: int, content: bytes, extended: int = 12) -> bytes:
+    """A message as the standard lays it out; from version 2 on with an extended header of so many bytes."""
+    body = content
+    if version >= 2:
+        body = struct.pack(">HHII", extended, 0, 0, stamp_s) + bytes(extended - 12) + content
+    return struct.pack(">H12s20sIIQQ", version, kind, name, stamp_s, 0, len(body), crc64_bit_by_bit(body)) + body
+
+
+def test_peers_of_every_manner_on_a_real_socket() -> None:
+    """Headers of versions 1 to 3, big images and unknown kinds between, a wrong checksum, joined and cut messages."""
+
+    def transform(version: int, k: int, extended: int = 12) -> bytes:
+        moved_by = pose_from_quaternion([1, 0, 0, 0], [k, 0, 0])
+        content = struct.pack(">12f", *moved_by[:3].T.ravel())
+        return by_hand(version, b"TRANSFORM", b"Tool", 1000 + k, content, extended)
+
+    image_header = struct.pack(">H12s20sIIQQ", 2, b"IMAGE", b"Ultrasound", 5, 0, 3 << 20, 0)  # its checksum is not kept
+    spoilt = bytearray(transform(1, 3))
+    spoilt[-1] ^= 1
+    last = transform(3, 8)
+    segments = [
+        transform(1, 0) + transform(2, 1),
+        transform(3, 2, extended=24) + bytes(spoilt),
+        image_header + bytes(3 << 20) + transform(1, 4),
+        by_hand(1, b"NEWKIND", b"Tool", 7, b"anything at all") + transform(2, 5),
+        by_hand(1, b"TRANSFORM", b"Tool", 7, b"too short") + transform(1, 6),
+        by_hand(2, b"STRING", b"Tool", 7, b"") + by_hand(1, b"GET_TRANS", b"", 7, b"") + transform(3, 7),
+        last[:20],
+        last[20:61],
+        last[61:],
+    ]
+    with (
+        socket.create_server(("127.0.0.1", 0)) as listener,
+        IgtlTracker("127.0.0.1", listener.getsockname()[1]) as tracker,
+        listener.accept()[0] as connection,
+    ):
+        sender = threading.Thread(target=lambda: [connection.sendall(segment) for segment in segments])
+        sender.start()
+        frames = collect(tracker, 8)
+        sender.join()
+    assert [frame.tools["Tool"].T_tracker_tool[0, 3] for frame in frames] == [0, 1, 2, 4, 5, 6, 7, 8]
+    assert tracker.counters.crc_errors == 1
+    assert tracker.counters.malformed == 1
+    assert tracker.other_messages == 4
+
+
 def test_what_is_no_pose_is_not_sent() -> None:
     for bad in (np.full((4, 4), np.nan), 2.0 * np.eye(4), np.zeros((4, 4))):
         with pytest.raises(DeviceInputError, match="no rigid"):
