@@ -18,6 +18,7 @@ from devices.errors import DeviceInputError, ProtocolError
 from devices.rotation import is_rigid, pose_from_quaternion
 
 __all__ = [
+    "DEFAULT_PORT",
     "HEADER_BYTES",
     "Message",
     "MessageReader",
@@ -33,6 +34,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
+DEFAULT_PORT = 18944
 HEADER_BYTES = 58
 _HEADER = struct.Struct(">H12s20sIIQQ")
 _EXTENDED = struct.Struct(">HHII")

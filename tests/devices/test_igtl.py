@@ -327,14 +327,38 @@ def test_a_client_that_does_not_read_holds_nobody_up() -> None:
         tracker.stop()
 
 
-def test_a_request_for_tracking_data_is_answered() -> None:
+def test_a_client_that_asks_for_tracking_data_gets_them() -> None:
+    """One TDATA message a frame, no more often than asked for, beside a client that gets TRANSFORM as before."""
     with IgtlServer(0) as server, socket.create_connection(("127.0.0.1", server.port)) as client:
+        tracker = IgtlTracker("127.0.0.1", server.port)
+        tracker.start()
+        while server.clients < 2:
+            tracker.read(0.01)
         client.settimeout(10.0)
-        client.sendall(encode("STT_TDATA", "tracker", 0.0, struct.pack(">I32s", 50, b"LPS")))
-        reader, replies = MessageReader(), []
-        while not replies:
-            replies = reader.feed(client.recv(4096))
-        assert (replies[0].kind, replies[0].content) == ("RTS_TDATA", b"\0\0")
+        reader, got = MessageReader(), []
+
+        def received(count: int) -> list[Message]:
+            while len(got) < count:
+                got.extend(reader.feed(client.recv(4096)))
+            return got
+
+        client.sendall(encode("STT_TDATA", "Tracker", 0.0, b"too short"))
+        client.sendall(encode("STT_TDATA", "Tracker", 0.0, struct.pack(">I32s", 40, b"LPS")))
+        assert [(m.kind, m.content) for m in received(2)] == [("RTS_TDATA", b"\1"), ("RTS_TDATA", b"\0")]
+        now_s = server.clock.now_s()
+        tools = {"a": moved(1.0), "b": moved(2.0), "lost": ToolPose(ToolStatus.MISSING, None)}
+        for k in range(5):
+            server.send(frame(k, now_s + 0.02 * k, tools))
+        kinds = [(m.kind, m.name) for m in received(8)[2:]]
+        assert kinds == [("TDATA", "Tracker"), ("STATUS", "lost")] * 3
+        poses = decode_poses(got[2])
+        assert [poses[name][0, 3] for name in ("a", "b")] == [1.0, 2.0]
+        client.sendall(encode("STP_TDATA", "Tracker", 0.0, b""))
+        assert received(9)[8].content == b"\0"
+        server.send(frame(5, now_s + 1.0, {"a": moved(3.0)}))
+        assert received(10)[9].kind == "TRANSFORM"
+        assert collect(tracker, 6)[-1].tools["a"].T_tracker_tool[0, 3] == 3.0
+        tracker.stop()
 
 
 def test_simulated_time_is_sent_as_it_is() -> None:
