@@ -261,7 +261,7 @@ class NdiTracker(Tracker):
             return None
         self._silent = self._refused = 0
         arrival_s = self.clock.now_s()
-        self._slow_s = max(arrival_s - due_s, 0.98 * self._slow_s)
+        self._slow_s = min(self._period_s, max(arrival_s - due_s, 0.98 * self._slow_s))
         frames = [self._frame(report, arrival_s) for report in reports]
         self._queue.extend(frame for frame in frames if frame is not None)
         self._plan_next(arrival_s, bool(self._queue))

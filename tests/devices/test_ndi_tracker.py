@@ -168,7 +168,7 @@ def test_a_lost_line_is_reported_and_found_again(line: str, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("line", LINES)
 def test_silence_is_reported_and_survived(line: str) -> None:
-    faults = Faults(silence_s=1.2, period=30)
+    faults = Faults(silence_s=1.2, period=120)
     tracker, emulator, _, reported = run_under(line, faults, "BX", 60, lambda *_: None)
     assert emulator.faults.happened["silence"] >= 1
     assert reported >= 1
