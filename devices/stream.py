@@ -68,8 +68,8 @@ class Stream:
     number_step : int
         How far the device's frame number moves from one frame to the next (a tracker at 20 Hz may count at 60 Hz).
     hurry : bool
-        False leaves the reader thread of a live tracker scheduled as any other, and Python's switch interval alone
-        (see `devices.scheduling`).
+        False leaves the reader thread of a live tracker scheduled as any other, and Python's switch interval and
+        garbage collector alone (see `devices.scheduling.hurried_thread`).
 
     Notes
     -----

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 import threading
 
@@ -52,9 +53,10 @@ def test_a_slow_callback_holds_up_neither_the_reader_nor_the_mailbox() -> None:
 
     with Stream(Endless(), on_frame=slow) as stream:
         newest = stream.wait(None, 20.0)
-        while newest.number < 257:  # one is with the callback, 256 wait; then the reader waits too
+        while newest.number < 258:  # one is with the callback, 256 wait; with the next the reader waits too
             newest = stream.wait(newest, 20.0)
-        assert newest.number == 257
+        assert newest.number == 258
+        assert stream.wait(newest, 0.1) is None
         assert not seen
         released.set()
         assert enough.wait(20.0)
@@ -94,19 +96,22 @@ def test_a_callback_may_stop_its_stream() -> None:
 
 
 @pytest.mark.parametrize("live", [True, False])
-def test_turns_are_short_while_a_live_tracker_is_read(live: bool) -> None:
+def test_turns_are_short_and_collections_quick_while_a_live_tracker_is_read(live: bool) -> None:
     usual = sys.getswitchinterval()
-    during: list[float] = []
+    frozen = gc.get_freeze_count()
+    during: list[tuple[float, int]] = []
     called = threading.Event()
 
     def look(_: TrackerFrame) -> None:
-        during.append(sys.getswitchinterval())
+        during.append((sys.getswitchinterval(), gc.get_freeze_count()))
         called.set()
 
     with Stream(Endless(live), on_frame=look) as stream:
         assert called.wait(20.0)
-    assert sys.getswitchinterval() == usual
-    assert during[0] == (pytest.approx(0.0005) if live else usual)
+    assert (sys.getswitchinterval(), gc.get_freeze_count()) == (usual, frozen)
+    interval_s, count = during[0]
+    assert interval_s == (pytest.approx(0.0005) if live else usual)
+    assert (count > frozen) == live
     assert (stream.scheduling == AS_ANY_OTHER) or live
 
 
