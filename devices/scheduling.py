@@ -8,10 +8,8 @@ import gc
 import os
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 
-__all__ = ["AS_ANY_OTHER", "hurried_thread", "hurry_this_thread"]
+__all__ = ["AS_ANY_OTHER", "HASTE", "Haste", "hurry_this_thread"]
 
 #: what `hurry_this_thread` says where nothing was granted
 AS_ANY_OTHER = "as any other thread"
@@ -26,9 +24,11 @@ def hurry_this_thread(real_time: bool = True) -> str:
     """Have the calling thread scheduled before ordinary ones, as far as this user may; return what was granted.
 
     Linux: the lowest real-time priority where the user may have one (``rtprio`` in ``limits.conf``, or root), else a
-    nice value of -10 (``nice`` there). Windows and macOS: the highest class of ordinary threads. Threads that this
-    one starts are ordinary again. (Short time slices, which Linux refuses nobody, were tried: on a machine with five
-    busy processes for two cores 200 of 800 frames were lost with them, 22 without, none with either priority.)
+    nice value of -10 (``nice`` there). Windows and macOS: the highest class of ordinary threads. A thread that holds
+    Python's lock while the system runs another process instead keeps all others of its process waiting, so threads that
+    compute beside one that reads a tracker are best hurried too. (Short time slices, which Linux refuses nobody, were
+    tried: on a machine with five busy processes for two cores 200 of 800 frames were lost with them, 22 without, none
+    with either priority.)
 
     Parameters
     ----------
@@ -64,8 +64,15 @@ def hurry_this_thread(real_time: bool = True) -> str:
     return AS_ANY_OTHER
 
 
-class _Haste:
-    """Python's switch interval shortened, and what exists kept from the garbage collector, while anyone needs it."""
+class Haste:
+    """Python kept from holding up the threads of this process, while anyone needs it; undone when nobody does.
+
+    Python hands over between threads every 5 ms as a rule, and a question to a tracker takes three turns: a thread that
+    computes in pure Python cost every third frame at 60 Hz, and none at 0.5 ms. A full garbage collection stops a
+    process that has the whole of `guidance` loaded for 0.12 s, seven frames; frozen, what exists is not gone through
+    (5 µs instead). Frames that are kept add to it, so it is frozen again now and then: `go_on`. What is frozen is
+    not collected before the end; that matters to garbage in cycles only.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -74,6 +81,7 @@ class _Haste:
         self._froze = False
 
     def begin(self) -> None:
+        """Need it from now on."""
         with self._lock:
             self._users += 1
             if self._users > 1:
@@ -84,7 +92,14 @@ class _Haste:
             if self._froze:
                 gc.freeze()
 
+    def go_on(self) -> None:
+        """Freeze what has come since; every few seconds."""
+        with self._lock:
+            if self._users and self._froze:
+                gc.freeze()
+
     def end(self) -> None:
+        """Need it no longer; once for each `begin`."""
         with self._lock:
             self._users -= 1
             if self._users > 0:
@@ -94,22 +109,5 @@ class _Haste:
                 gc.unfreeze()
 
 
-_haste = _Haste()
-
-
-@contextmanager
-def hurried_thread() -> Iterator[str]:
-    """Hurry the calling thread, and while it runs keep Python from holding it up for long.
-
-    Python hands over between threads every 5 ms as a rule, and a question to a tracker takes three turns: a thread that
-    computes in pure Python cost every third frame at 60 Hz, and none at 0.5 ms. A full garbage collection stops a
-    process that has the whole of `guidance` loaded for 0.12 s, seven frames; frozen, what exists is not gone through
-    (5 µs instead). Both hold for the whole process, and are undone when the last hurried thread has ended. A thread
-    that holds Python's lock while the system runs another process instead still keeps this one waiting: threads that
-    compute beside it are best hurried too.
-    """
-    _haste.begin()
-    try:
-        yield hurry_this_thread()
-    finally:
-        _haste.end()
+#: the one of this process
+HASTE = Haste()

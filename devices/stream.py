@@ -11,7 +11,7 @@ from typing import Self
 
 from devices.errors import DeviceError, TransportError
 from devices.frame import TrackerFrame
-from devices.scheduling import AS_ANY_OTHER, hurried_thread, hurry_this_thread
+from devices.scheduling import AS_ANY_OTHER, hurry_this_thread
 from devices.tracker import Tracker
 
 __all__ = ["Stream", "StreamCounters"]
@@ -68,8 +68,7 @@ class Stream:
     number_step : int
         How far the device's frame number moves from one frame to the next (a tracker at 20 Hz may count at 60 Hz).
     hurry : bool
-        False leaves the reader thread of a live tracker scheduled as any other, and Python's switch interval and
-        garbage collector alone (see `devices.scheduling.hurried_thread`).
+        False leaves the threads for a live tracker scheduled as any other (see `devices.scheduling`).
 
     Notes
     -----
@@ -219,10 +218,8 @@ class Stream:
     def _run(self) -> None:
         try:
             if self._hurry and self.tracker.is_live:
-                with hurried_thread() as self.scheduling:
-                    self._read_on()
-            else:
-                self._read_on()
+                self.scheduling = hurry_this_thread()
+            self._read_on()
         except BaseException as error:  # every error of this thread belongs to the caller
             self._hand_over(error)
         finally:

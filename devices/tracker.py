@@ -12,10 +12,13 @@ from typing import Self
 from devices.clock import Clock, SystemClock
 from devices.errors import DeviceInputError, TrackerError
 from devices.frame import TrackerFrame
+from devices.scheduling import HASTE
 
 __all__ = ["LineCounters", "Tracker"]
 
 _ATTEMPT_EVERY_S = 0.25
+#: frames of a live tracker between two looks at the garbage collector
+_FREEZE_EVERY = 256
 
 
 @dataclass
@@ -54,6 +57,7 @@ class Tracker(ABC):
         self.counters = LineCounters()
         self._stopping = Event()
         self._running = False
+        self._since_freeze = 0
         self._next_attempt_s = -math.inf
 
     @property
@@ -92,6 +96,8 @@ class Tracker(ABC):
         self._stopping.clear()
         self._start()
         self._running = True
+        if self.is_live:
+            HASTE.begin()
 
     def interrupt(self) -> None:
         """End a `read` that waits, from any thread; what follows can only be `stop`."""
@@ -102,6 +108,8 @@ class Tracker(ABC):
         self.interrupt()
         if self._running:
             self._running = False
+            if self.is_live:
+                HASTE.end()
             self._stop()
 
     def read(self, timeout_s: float = 1.0) -> TrackerFrame | None:
@@ -123,7 +131,13 @@ class Tracker(ABC):
             raise DeviceInputError(f"read: the timeout must be ≥ 0 s, got {timeout_s!r}")
         if not self._running:
             raise TrackerError(f"{type(self).__name__}: read before start(); use a with block or call start() first")
-        return self._read(timeout_s)
+        frame = self._read(timeout_s)
+        if frame is not None and self.is_live:
+            self._since_freeze += 1
+            if self._since_freeze >= _FREEZE_EVERY:
+                self._since_freeze = 0
+                HASTE.go_on()
+        return frame
 
     def __enter__(self) -> Self:
         self.start()

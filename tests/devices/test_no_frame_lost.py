@@ -15,7 +15,7 @@ from devices.ndi.device import Device
 from devices.ndi.emulator import PtyEmulator, TcpEmulator
 from devices.ndi.pace import PacedClock
 from devices.ndi.protocol import command
-from devices.scheduling import AS_ANY_OTHER, hurried_thread, hurry_this_thread
+from devices.scheduling import AS_ANY_OTHER, HASTE, hurry_this_thread
 
 PERIOD_S = 1.0 / 60.0
 
@@ -115,23 +115,39 @@ def test_turns_are_short_and_collections_quick_while_a_live_tracker_is_read(live
     assert (stream.scheduling == AS_ANY_OTHER) or live
 
 
-def test_two_hurried_threads_leave_the_interval_as_it_was() -> None:
-    usual = sys.getswitchinterval()
-    seen: list[float] = []
+def test_two_in_haste_leave_everything_as_it_was() -> None:
+    usual = (sys.getswitchinterval(), gc.get_freeze_count())
+    for _ in range(2):
+        HASTE.begin()
+    HASTE.end()
+    assert sys.getswitchinterval() == pytest.approx(0.0005)
+    kept = [[] for _ in range(1000)]
+    before = gc.get_freeze_count()
+    HASTE.go_on()
+    assert gc.get_freeze_count() >= before + len(kept)
+    HASTE.end()
+    assert (sys.getswitchinterval(), gc.get_freeze_count()) == usual
 
-    def run() -> None:
-        with hurried_thread() as granted:
-            assert granted
-            with hurried_thread():
-                pass
-            seen.append(sys.getswitchinterval())
-        assert hurry_this_thread(real_time=False)
 
-    thread = threading.Thread(target=run)
+def test_who_froze_on_purpose_stays_frozen() -> None:
+    gc.freeze()
+    try:
+        count = gc.get_freeze_count()
+        HASTE.begin()
+        HASTE.go_on()
+        HASTE.end()
+        assert gc.get_freeze_count() == count
+    finally:
+        gc.unfreeze()
+
+
+def test_a_thread_may_always_ask_for_haste() -> None:
+    said: list[str] = []
+    thread = threading.Thread(target=lambda: said.extend([hurry_this_thread(real_time=False), hurry_this_thread()]))
     thread.start()
     thread.join()
-    assert seen == [pytest.approx(0.0005)]
-    assert sys.getswitchinterval() == usual
+    assert len(said) == 2
+    assert all(said)
 
 
 class Served:
