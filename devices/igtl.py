@@ -21,6 +21,8 @@ from devices.transport import TcpLine
 __all__ = ["DEFAULT_PORT", "IgtlServer", "IgtlTracker"]
 
 _SLICE_S = 0.02
+#: a group of messages that does not go on for so long is a frame; a peer that was held up for less goes on in it
+_PAUSE_S = 0.04
 _POSES = ("TRANSFORM", "TDATA", "POSITION", "QTRANS")
 _WANTED = frozenset((*_POSES, "STATUS"))
 
@@ -59,6 +61,7 @@ class IgtlTracker(Tracker):
         self._queue: deque[TrackerFrame] = deque()
         self._names: dict[str, None] = {}
         self._number = -1
+        self._idle_s = 0.0
         #: messages received, of any kind, and those of kinds that hold no poses
         self.messages = self.other_messages = 0
         #: header timestamp of the last frame made, Unix time; 0 where the sender gives none
@@ -97,16 +100,19 @@ class IgtlTracker(Tracker):
             self.counters.reconnects += 1
         remaining_s = timeout_s
         while not self._queue and not self._stopping.is_set():
+            slice_s = min(_SLICE_S, remaining_s)
             try:
-                data = self.line.read(min(_SLICE_S, remaining_s))
+                data = self.line.read(slice_s)
             except TransportError:
                 if self._stopping.is_set():
                     return None
                 raise
             if data:
+                self._idle_s = 0.0
                 self._take(data)
                 continue
-            if self._groups.current:
+            self._idle_s += slice_s
+            if self._groups.current and self._idle_s >= _PAUSE_S and not self._reader.pending:
                 self._close_group()
             remaining_s -= _SLICE_S
             if remaining_s <= 0.0:

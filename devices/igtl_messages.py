@@ -150,6 +150,11 @@ class MessageReader:
         self._wanted = wanted
         self.lost = False
 
+    @property
+    def pending(self) -> int:
+        """Number of bytes of a message that is not complete."""
+        return len(self._buffer)
+
     def feed(self, data: bytes) -> list[Message | ProtocolError]:
         """Take bytes as they came; return what they complete, in order."""
         self._buffer += data
