@@ -231,9 +231,13 @@ class IgtlServer:
             link, _ = listener.accept()
         except OSError:
             return
-        link.setblocking(False)
-        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # or half-open clients stay for ever
+        try:
+            link.setblocking(False)
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # or half-open clients stay for ever
+        except OSError:  # gone again already
+            link.close()
+            return
         with self._lock:
             self._clients[link] = _Client()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import select
 import socket
+import threading
 from abc import ABC, abstractmethod
 
 import serial
@@ -177,6 +178,8 @@ class TcpLine(Line):
             raise DeviceInputError(f"expected HOST:PORT with a port in 1–65535, got {host!r}:{port}")
         self.host, self.port, self._connect_timeout_s = host, port, connect_timeout_s
         self._socket: socket.socket | None = None
+        self._closed = 0  # how often: a connection that comes up after another thread closed the line is not kept
+        self._lock = threading.Lock()
 
     def __str__(self) -> str:
         return f"{self.host}:{self.port}"
@@ -189,17 +192,26 @@ class TcpLine(Line):
     def open(self) -> None:
         """Connect."""
         self.close()
+        before = self._closed
         try:
             connection = socket.create_connection((self.host, self.port), self._connect_timeout_s)
         except OSError as error:
             raise TransportError(f"{self}: no connection: {error}; is the device on, and in this network?") from error
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.settimeout(2.0)
-        self._socket = connection
+        with self._lock:
+            wanted = self._closed == before
+            if wanted:
+                self._socket = connection
+        if not wanted:
+            connection.close()
+            raise TransportError(f"{self}: closed while it was connecting")
 
     def close(self) -> None:
         """Close the connection."""
-        connection, self._socket = self._socket, None
+        with self._lock:
+            self._closed += 1
+            connection, self._socket = self._socket, None
         if connection is not None:
             connection.close()
 
