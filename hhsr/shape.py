@@ -17,6 +17,7 @@ from hhsr.batches import in_parts
 from hhsr.check import as_float, as_points, as_rigid, require_finite
 from hhsr.compiled import Compiled, compile_tree
 from hhsr.errors import FileFormatError, InputError
+from hhsr.kernels import contains as contains_kernels
 from hhsr.kernels import crossing as crossing_kernels
 from hhsr.kernels import distance as distance_kernels
 from hhsr.kernels import tree as tree_kernels
@@ -165,14 +166,14 @@ class Shape:
         on_invalid="mark": int8 instead, 1 inside, 0 outside, −1 where a point is not finite (else that is InputError).
         """
         if type(points) is np.ndarray and points.shape == (3,) and points.dtype == np.float64:
-            code = tree_kernels.contains_one(self._blob, points)
+            code = contains_kernels.contains_one(self._blob, points)
             if code >= 0 and on_invalid == "raise":
                 return code == 1
         array, mark = as_points(points), _marks(on_invalid)
         flat = array.reshape(-1, 3)
         out = np.empty(len(flat), dtype=np.int8)
         blob = self._blob
-        bad = sum(in_parts(len(flat), 20_000, lambda i, j: tree_kernels.contains_many(blob, flat[i:j], out[i:j])))
+        bad = sum(in_parts(len(flat), 20_000, lambda i, j: contains_kernels.contains_many(blob, flat[i:j], out[i:j])))
         if bad and not mark:
             require_finite(array, "points")
         result = out.reshape(array.shape[:-1])

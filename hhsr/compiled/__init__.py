@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from hhsr.compiled.proofs import BandTables, Proofs
+from hhsr.compiled.proofs import BandTables, Proofs, read_only
 from hhsr.compiled.records import pose_arrays
 from hhsr.kernels import layout as at
 from hhsr.model import FloatArray, Tree, frozen, rotation_matrix
@@ -48,15 +48,12 @@ class Compiled:
 def compile_tree(tree: Tree) -> Compiled:
     """Lay a tree out flat and prove its bounds; every tree has a solid, whatever its numbers (DESIGN §2)."""
     layout = Proofs(tree)
-    blob = layout.assemble()
-    view = blob.view()
-    view.setflags(write=False)
-    for owner in layout.owners:
-        if owner.kind == at.MODEL:
-            layout.fill_map(blob, view, owner)
+    blob = layout.fill_facets(layout.fill_maps(layout.assemble()))
+    view = read_only(blob)
     tables = layout.fill_bands(blob, view)
     layout.fill_boxes(blob, view)
     layout.fill_edges(blob, view)
+    blob = layout.fill_voxels(blob)
     start = int(layout.header(blob)[at.POSE])
     blob[start : start + 12] = pose_arrays(tree.pose)
     blob.setflags(write=False)

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hhsr.compiled.edges import straight_edges
+from hhsr.compiled.leaf_maps import fill_leaf_maps
 from hhsr.compiled.records import Owner, Records
 from hhsr.kernels import layout as at
 from hhsr.kernels import slab as slab_at
 from hhsr.kernels.crossing import first_exits
-from hhsr.kernels.maps import build_map, pyramid_size
+from hhsr.kernels.facets import DISC_SIZE, FAN, fill_nodes, level_sizes, list_facets, place_facets
 from hhsr.kernels.region_box import leaf_box, part_box
 from hhsr.kernels.slab_bounds import fill_lobe_spheres
+from hhsr.kernels.voxels import fill_leaps, fill_voxels
 from hhsr.model import Cut, FloatArray, ModelLeaf, RetainedPart, rotation_matrix
+
+VOXELS_TOTAL = 500_000  # a byte each
 
 BandTables = tuple[tuple[tuple[FloatArray, FloatArray], ...], ...]
 
@@ -22,24 +28,52 @@ BandTables = tuple[tuple[tuple[FloatArray, FloatArray], ...], ...]
 class Proofs(Records):
     """The steps that fill what is proven, in the order in which one needs the other."""
 
-    def fill_map(self, blob: FloatArray, blob_view: FloatArray, owner: Owner) -> None:
-        """Prove the bounds of one leaf."""
+    def fill_maps(self, blob: FloatArray) -> FloatArray:
+        """Return the blob with the maps of the leaves behind it."""
+        leaves = [owner for owner in self.owners if owner.kind == at.MODEL]
+        return appended(blob, fill_leaf_maps(blob, read_only(blob), leaves))
+
+    def fill_facets(self, blob: FloatArray) -> FloatArray:
+        """Return the blob with the facets of all leaves behind it."""
+        view = read_only(blob)
+        codes, discs = [], []
+        for number, owner in enumerate(self.owners):
+            if owner.kind == at.MODEL:
+                room = self._cells(blob, owner)
+                own, around = np.empty(room, dtype=np.int64), np.empty((room, DISC_SIZE))
+                found = list_facets(view, number, owner.record, owner.planes_at, len(owner.planes), own, around)
+                codes.append(own[:found])
+                discs.append(around[:found])
+        if not codes:
+            return blob
+        code, disc = np.concatenate(codes), np.concatenate(discs)
+        keys, groups = np.empty(len(code), dtype=np.int64), np.empty(len(code), dtype=np.int64)
+        place_facets(view, code, keys, groups)
+        order = np.argsort(keys, kind="stable")
+        code, disc, groups = code[order], disc[order], groups[order]
+        new = np.concatenate([[True], groups[1:] != groups[:-1]]) if len(code) else np.zeros(0, dtype=bool)
+        starts = np.flatnonzero(new)
+        slot = FAN * (np.cumsum(new) - 1) + np.arange(len(code)) - np.repeat(starts, np.diff([*starts, len(code)]))
+        room = FAN * len(starts)
+        facets, around = np.full(room, -1, dtype=np.int64), np.full((room, DISC_SIZE), -1.0)
+        facets[slot], around[slot] = code, disc
+        code, disc = facets, around
+        sizes = np.array(level_sizes(len(code)), dtype=np.int64)
+        nodes = np.empty((int(sizes.sum()), DISC_SIZE), dtype=np.float32)
+        if len(code):
+            fill_nodes(disc, sizes, nodes)
+        head, start = self.header(blob), len(blob)
+        head[at.FACET_COUNT], head[at.FACET_CODES], head[at.FACET_LEVELS] = len(code), start, start + len(code)
+        first = 2 * (start + len(code) + 1 + 2 * len(sizes) - int(head[at.MAP_START]))
+        starts = first + DISC_SIZE * np.concatenate([[0], np.cumsum(sizes)[:-1]]) if len(sizes) else sizes
+        levels = np.column_stack([starts, sizes]).ravel()
+        return appended(appended(blob, np.concatenate([code, [len(sizes)], levels]).astype(np.int64)), nodes)
+
+    def _cells(self, blob: FloatArray, owner: Owner) -> int:
+        """Return how many cells the map of a leaf has."""
         ints = blob.view(np.int64)
-        record = ints[owner.record : owner.record + at.LEAF_INT_SIZE]
-        tables = blob[ints[at.MAP_START] :].view(np.float32)
-        n = int(record[at.CELLS])
-        size = pyramid_size(n)
-        cells, ranges, spheres = (int(record[k]) for k in (at.CELL_TABLE, at.RANGE_TABLE, at.SPHERE_TABLE))
-        box = int(record[at.BOX])
-        build_map(
-            blob_view,
-            owner.record,
-            n,
-            tables[cells : cells + 6 * n * n * at.CELL_SIZE].reshape(6, n, n, at.CELL_SIZE),
-            tables[ranges : ranges + 2 * size].reshape(size, 2),
-            tables[spheres : spheres + 4 * size].reshape(size, 4),
-            blob[box : box + 8],
-        )
+        last = int(ints[ints[owner.record + at.PARTING] + 6 * ints[owner.record + at.CELLS] ** 2 - 1])
+        return (last >> 4) + 4 ** (last & 7)
 
     def fill_bands(self, blob: FloatArray, blob_view: FloatArray) -> BandTables:
         """Fill L and R of every lobe, the deepest cuts first: a child's section already has its own bands."""
@@ -140,6 +174,25 @@ class Proofs(Records):
         for k, edge in enumerate(edges):
             blob[start + 6 * k : start + 6 * k + 6] = edge
 
+    def fill_voxels(self, blob: FloatArray) -> FloatArray:
+        """Return the finished blob with the grid of voxels behind it."""
+        low, high = self.bounds(blob, np.eye(3), np.zeros(3))
+        extent = high - low
+        if not np.isfinite(extent).all() or not (extent > 0).all():
+            return blob
+        side = float((np.prod(extent) / VOXELS_TOTAL) ** (1.0 / 3.0))
+        side = max(side, float(extent.max()) / 1000.0)
+        low = low - 0.5 * side
+        counts = np.ceil((high - low) / side + 0.5).astype(np.int64)
+        voxels = np.empty(tuple(int(c) for c in counts), dtype=np.int8)
+        fill_voxels(read_only(blob), low, side, counts, voxels)
+        fill_leaps(voxels)
+        start = len(blob)
+        grown = appended(appended(blob, np.concatenate([counts, [0]])), np.array([*low, side, 1.0 / side]))
+        head = self.header(grown)
+        head[at.VOXELS], head[at.VOXEL_FRAME], head[at.VOXEL_BYTES] = start, start + 4, start + 9
+        return appended(grown, voxels)
+
     def bounds(self, blob_view: FloatArray, rotation: FloatArray, shift: FloatArray) -> FloatArray:
         """Return (2, 3) the box of the solid after a rigid motion: of its patches and straight edges."""
         boxes = [self._owner_box(blob_view, o, rotation, shift) for o in self.owners]
@@ -157,3 +210,19 @@ def _union(boxes: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
         if box[0] <= box[3]:
             low, high = np.minimum(low, box[:3]), np.maximum(high, box[3:])
     return low, high
+
+
+def read_only(blob: FloatArray) -> FloatArray:
+    """Return a view of the blob as the kernels take it: one signature for all."""
+    view = blob.view()
+    view.setflags(write=False)
+    return view
+
+
+def appended(blob: FloatArray, table: NDArray[Any]) -> FloatArray:
+    """Return the blob with a table of any numbers behind it."""
+    words = -(-table.nbytes // 8)
+    grown = np.zeros(len(blob) + words)
+    grown[: len(blob)] = blob
+    grown[len(blob) :].view(table.dtype)[: table.size] = table.ravel()
+    return grown

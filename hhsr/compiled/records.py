@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,17 +11,14 @@ from hhsr.evaluate import contour_arrays, leaf_arrays
 from hhsr.kernels import layout as at
 from hhsr.kernels import part as part_at
 from hhsr.kernels import slab as slab_at
-from hhsr.kernels.maps import blocks_of, pyramid_size
+from hhsr.kernels.maps import blocks_of
 from hhsr.model import Cut, FloatArray, ModelLeaf, Node, RetainedPart, Tree, rotation_matrix
 from hhsr.triangle_tree import TriangleTree
 
 Plane = tuple[FloatArray, float]  # n, c: the half space n·p ≤ c
 
-# Cells a face side of a leaf's map, by the least support (rad) of its centres: a cell must be small against it.
-MAP_SIZES = ((0.12, 256), (0.2, 128), (math.inf, 64))
-MAP_CELLS_TOTAL = (
-    80_000  # cells a face over all leaves (32 bytes each, six faces: 15 MB); beyond, the coarsest give way
-)
+BASE_SIDE = 32  # base cells a face side of a leaf's map, where there are few leaves
+BASE_CELLS_TOTAL = 100_000  # over all leaves, 16 bytes each before they are parted
 
 
 @dataclass
@@ -32,7 +28,6 @@ class Sections:
     ints: list[int] = field(default_factory=lambda: [0] * at.HEADER_SIZE)
     floats: list[FloatArray] = field(default_factory=list)
     float_count: int = 0
-    table_count: int = 0
 
     def add_floats(self, values: NDArray[np.float64]) -> int:
         """Append numbers; return their offset among the floats."""
@@ -71,7 +66,7 @@ class Records:
         self.tables: list[tuple[int, int, int]] = []
         self.slab_records: dict[int, tuple[int, list[int]]] = {}
         self._visit(tree.root, [])
-        self.cells = _map_sizes([o.source for o in self.owners if isinstance(o.source, ModelLeaf)])
+        self.base_side = base_side(sum(isinstance(o.source, ModelLeaf) for o in self.owners))
         self._records()
 
     def _visit(self, node: Node, planes: list[Plane]) -> int:
@@ -135,21 +130,14 @@ class Records:
         record[at.HALF_AXES] = parts.add_floats(arrays.half_axes)
         record[at.AZIMUTH], record[at.AZIMUTH_COUNT] = parts.add_floats(arrays.azimuth), len(arrays.azimuth)
         record[at.ELEVATION], record[at.ELEVATION_COUNT] = parts.add_floats(arrays.elevation), len(arrays.elevation)
-        rows = np.column_stack([arrays.centres, arrays.inverse_extents, arrays.weights])
-        record[at.CENTRES], record[at.CENTRE_COUNT] = parts.add_floats(rows), len(rows)
-        offsets, index = blocks_of(arrays.centres, arrays.inverse_extents)
-        record[at.BLOCKS] = parts.add_ints((offsets + len(parts.ints) + len(offsets)).tolist())
-        parts.add_ints(index.tolist())
+        offsets, rows = blocks_of(arrays.centres, arrays.inverse_extents, arrays.weights)
+        record[at.BLOCKS], record[at.BLOCK_DATA] = parts.add_ints(offsets.tolist()), parts.add_floats(rows)
         rotation = rotation_matrix(leaf.rotation)
         record[at.FRAME] = parts.add_floats(np.concatenate([leaf.centre, rotation.ravel()]))
         record[at.ROTATED] = int(not np.array_equal(rotation, np.eye(3)))
         record[at.BOX] = parts.add_floats(np.zeros(8))
-        cells = self.cells.pop(0)
-        record[at.CELLS] = cells
-        record[at.CELL_TABLE] = parts.table_count
-        record[at.RANGE_TABLE] = record[at.CELL_TABLE] + 6 * cells**2 * at.CELL_SIZE
-        record[at.SPHERE_TABLE] = record[at.RANGE_TABLE] + 2 * pyramid_size(cells)
-        parts.table_count = record[at.SPHERE_TABLE] + 4 * pyramid_size(cells)
+        record[at.CELLS], record[at.CELL_BITS] = self.base_side, self.base_side.bit_length() - 1
+        record[at.PARTING] = parts.add_ints([0] * (6 * self.base_side**2))
         return parts.add_ints(record)
 
     def _part_record(self, part: RetainedPart) -> int:
@@ -191,7 +179,7 @@ class Records:
     # -- assembly -----------------------------------------------------------------------------------------------------
 
     # Records hold offsets among the floats; in the blob the floats come after the integers, so these move by `shift`.
-    _LEAF_FLOATS = (at.HALF_AXES, at.AZIMUTH, at.ELEVATION, at.CENTRES, at.FRAME, at.BOX)
+    _LEAF_FLOATS = (at.HALF_AXES, at.AZIMUTH, at.ELEVATION, at.BLOCK_DATA, at.FRAME, at.BOX)
     _PART_FLOATS = (part_at.BOXES, part_at.CORNERS, part_at.EXTENT)
     _LOBE_FLOATS = (
         slab_at.LOBE_TABLES,
@@ -238,7 +226,7 @@ class Records:
             ]
         ints[at.EDGE_FLOATS] = shift + self.parts.float_count
         ints[at.MAP_START] = shift + self.parts.float_count + 6 * most_edges
-        blob = np.zeros(ints[at.MAP_START] + (self.parts.table_count + 1) // 2)
+        blob = np.zeros(ints[at.MAP_START])
         blob.view(np.int64)[:shift] = ints
         blob[shift : shift + self.parts.float_count] = np.concatenate(self.parts.floats)
         self.most_edges = most_edges
@@ -249,20 +237,12 @@ class Records:
         return blob.view(np.int64)[: at.HEADER_SIZE]
 
 
-def _map_sizes(leaves: list[ModelLeaf]) -> list[int]:
-    """Return the cells a face side of each leaf's map: finer where its centres are, within the memory for all."""
-    supports = [
-        math.acos(max(1.0 - float(leaf.scale_field.grid.extents[leaf.scale_field.index].min()), -1.0))
-        if leaf.scale_field.index.size
-        else math.pi
-        for leaf in leaves
-    ]
-    sizes = [next(n for limit, n in MAP_SIZES if s < limit or limit == math.inf) for s in supports]
-    for least in (128, 64, 32, 16):
-        for k in sorted(range(len(leaves)), key=lambda k: -supports[k]):
-            if sum(n * n for n in sizes) > MAP_CELLS_TOTAL and sizes[k] > least:
-                sizes[k] = least
-    return sizes
+def base_side(leaves: int) -> int:
+    """Return the base cells a face side for each of so many leaves."""
+    side = BASE_SIDE
+    while side > 8 and leaves * 6 * side * side > BASE_CELLS_TOTAL:
+        side //= 2
+    return side
 
 
 def pose_arrays(pose: FloatArray) -> FloatArray:

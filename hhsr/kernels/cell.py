@@ -13,16 +13,17 @@ from hhsr.kernels.interval import product, widened
 from hhsr.kernels.layout import (
     AZIMUTH,
     AZIMUTH_COUNT,
+    BLOCK_DATA,
+    BLOCK_ROWS,
     BLOCKS,
     BLOCKS_PER_SIDE,
-    CENTRE_SIZE,
-    CENTRES,
     ELEVATION,
     ELEVATION_COUNT,
     HALF_AXES,
 )
 from hhsr.kernels.leaf import MAX_SCALE
 from hhsr.kernels.norm_bounds import norm_range
+from hhsr.kernels.sphere_rbf import gaussian_sum
 from hhsr.kernels.superquadric import superquadric_norm
 
 BORDER = math.exp(-4.0)
@@ -74,17 +75,14 @@ def block_of(face, a, b):
 
 @njit(cache=True, error_model="numpy")
 def scale_in_block(blob, ints, leaf, block, ux, uy, uz):
-    """Return s(u), summed over the centres of the block in the order of the record: the same float as over all."""
-    total = 0.0
-    rows = ints[leaf + CENTRES]
-    start = ints[leaf + BLOCKS]
-    for i in range(ints[start + block], ints[start + block + 1]):
-        o = rows + CENTRE_SIZE * ints[i]
-        h = (1.0 - (ux * blob[o] + uy * blob[o + 1] + uz * blob[o + 2])) * blob[o + 3]
-        if h < 1.0:
-            rest = 1.0 - h
-            total += blob[o + 4] * (math.exp(-4.0 * h) * rest * rest)
-    return total
+    """Return s(u), summed over the centres of the block."""
+    start = ints[leaf + BLOCKS] + block
+    o = ints[leaf + BLOCK_DATA] + ints[start]
+    n = (ints[start + 1] - ints[start]) // BLOCK_ROWS
+    return gaussian_sum(
+        blob[o : o + n], blob[o + n : o + 2 * n], blob[o + 2 * n : o + 3 * n], blob[o + 3 * n : o + 4 * n],
+        blob[o + 4 * n : o + 5 * n], ux, uy, uz,
+    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
@@ -124,9 +122,10 @@ def inverse_radius(blob, ints, leaf, face, a, b):
 
 @njit(cache=True, error_model="numpy")
 def scale_range(blob, ints, leaf, block, face, a, b, half_a, half_b):
-    """Return (s, s_a, s_b, wide_a, wide_b, s_aa, s_ab, s_bb, wide_h) of the scale field over a rectangle.
+    """Return (s, s_a, s_b, wide_a, wide_b, s_aa, s_ab, s_bb, rest2, rest3) of the scale field over a rectangle.
 
-    Values at its centre; over it the gradient stays within ± wide_a, ± wide_b, each second derivative within ± wide_h.
+    Values at its centre; over it the gradient stays within ± wide_a, ± wide_b. Along any line the second derivative is
+    that of the Hessian to rest2 + r·rest3 at r from the centre.
 
     Value, gradient and Hessian at the centre; the rest of the gradient is at most r²/2 times the third derivative
     along any line of the chart, and r times the second of supports that the rectangle only touches; at the border of
@@ -146,11 +145,13 @@ def scale_range(blob, ints, leaf, block, face, a, b, half_a, half_b):
     q3 = q1 * q1 * q1
     value = ga = gb = haa = hab = hbb = 0.0
     rest2 = rest3 = 0.0
-    rows = ints[leaf + CENTRES]
-    start = ints[leaf + BLOCKS]
-    for i in range(ints[start + block], ints[start + block + 1]):
-        o = rows + CENTRE_SIZE * ints[i]
-        cx, cy, cz, inverse, w = blob[o], blob[o + 1], blob[o + 2], blob[o + 3], blob[o + 4]
+    start = ints[leaf + BLOCKS] + block
+    first = ints[leaf + BLOCK_DATA] + ints[start]
+    n = (ints[start + 1] - ints[start]) // BLOCK_ROWS
+    for o in range(first, first + n):
+        cx, cy, cz, inverse, w = blob[o], blob[o + n], blob[o + 2 * n], blob[o + 3 * n], blob[o + 4 * n]
+        if inverse == 0.0:
+            break
         tau = ux * cx + uy * cy + uz * cz
         sine = math.sqrt(max(1.0 - tau * tau, 0.0)) + 2e-8  # what rounding can hide near τ = 1
         top = 1.0 if tau >= cos_delta else tau * cos_delta + sine * sin_delta
@@ -212,7 +213,7 @@ def scale_range(blob, ints, leaf, block, face, a, b, half_a, half_b):
     rest = 0.5 * r * r * rest3 + r * rest2
     wide_a = abs(haa) * half_a + abs(hab) * half_b + rest
     wide_b = abs(hab) * half_a + abs(hbb) * half_b + rest
-    return value, ga, gb, wide_a, wide_b, haa, hab, hbb, r * rest3 + rest2
+    return value, ga, gb, wide_a, wide_b, haa, hab, hbb, rest2, rest3
 
 
 @njit(cache=True, error_model="numpy")
@@ -223,29 +224,31 @@ def axis_scale(blob, half_axes, axis, sign):
 
 
 @njit(cache=True, error_model="numpy")
-def _second(scale, ni_lo, ni_hi, nj_lo, nj_hi, n_lo, n_hi, d_lo, d_hi, si_lo, si_hi, sj_lo, sj_hi, ss_lo, ss_hi):
-    """Return the range of D N_ij + D² (N_i s_j + N_j s_i + N s_ij) + 2 D³ N s_i s_j, N_ij = (scale − N_i N_j)/N."""
-    lo, hi = product(ni_lo, ni_hi, nj_lo, nj_hi)
-    lo, hi = product(scale - hi, scale - lo, d_lo / n_hi, d_hi / n_lo)
-    p0, p1 = product(ni_lo, ni_hi, sj_lo, sj_hi)
-    q0, q1 = product(nj_lo, nj_hi, si_lo, si_hi)
-    r0, r1 = product(n_lo, n_hi, ss_lo, ss_hi)
-    a0, a1 = product(p0 + q0 + r0, p1 + q1 + r1, d_lo * d_lo, d_hi * d_hi)
-    b0, b1 = product(si_lo, si_hi, sj_lo, sj_hi)
-    b0, b1 = product(b0, b1, 2.0 * n_lo * d_lo * d_lo * d_lo, 2.0 * n_hi * d_hi * d_hi * d_hi)
-    return lo + a0 + b0, hi + a1 + b1
+def _third(n_lo, n_hi, n1, n2, d, s1, s2, s3):
+    """Return a bound of the third derivative of W = N·D, D = 1/(1 − s), along any line of the chart.
+
+    n1, s1, s2, s3: bounds of the first, second and third derivatives; n2 of the second of N, an ellipsoid's norm, whose
+    square is quadratic, so that N times its third derivative is −3 times its first times its second. d: the greatest D.
+    """
+    d1, d2 = d * d * s1, d * d * (s2 + 2.0 * d * s1 * s1)
+    d3 = d * d * (s3 + 6.0 * d * s1 * (s2 + d * s1 * s1))
+    return 3.0 * n1 * n2 / n_lo * d + 3.0 * n2 * d1 + 3.0 * n1 * d2 + n_hi * d3
 
 
 @njit(cache=True, error_model="numpy")
 def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
-    """Return (value, slope_a, slope_b, error, spread_a, spread_b, lo, hi) of W over a rectangle about (a, b).
+    """Return (value, slope_a, slope_b, error, spread_a, spread_b, lo, hi, bend_lo, bend_hi) of W over a rectangle.
 
-    |W − value − slope·δ| ≤ error, |∂W − slope| ≤ spread and lo ≤ W ≤ hi hold on the whole rectangle, proven; `value` is
-    the middle of that strip, not W at the centre. The
-    rectangle must lie within one block of directions and straddle no coordinate plane.
+    |W − value − slope·δ| ≤ error, |∂W − slope| ≤ spread, lo ≤ W ≤ hi, and the eigenvalues of ∂²W lie in [bend_lo, bend_hi]
+    (infinite where the base is no ellipsoid or the field may be capped): all proven on the whole rectangle about (a, b).
+    `value` is the middle of that strip, not W at the centre. The rectangle must lie within one block of directions and
+    straddle no coordinate plane.
     """
+    bend_lo, bend_hi = -math.inf, math.inf
     block = block_of(face, a, b)
-    s, sa, sb, wide_a, wide_b, saa, sab, sbb, wide_h = scale_range(blob, ints, leaf, block, face, a, b, half_a, half_b)
+    s, sa, sb, wide_a, wide_b, saa, sab, sbb, rest2, rest3 = scale_range(
+        blob, ints, leaf, block, face, a, b, half_a, half_b
+    )
     sa_lo, sa_hi, sb_lo, sb_hi = sa - wide_a, sa + wide_a, sb - wide_b, sb + wide_b
     x, y, z = direction_of(face, a, b)
     norm = norm_at(blob, ints, leaf, x, y, z)
@@ -300,7 +303,7 @@ def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
     spread_a, spread_b = 0.5 * (wa_hi - wa_lo), 0.5 * (wb_hi - wb_lo)
     error = (spread_a * half_a + spread_b * half_b) * (1.0 + 1e-11) + 1e-11 * abs(value)
     if smooth:
-        # An ellipsoid: N_ij = (A_i² δ_ij − N_i N_j)/N, and Taylor to second order, with D_i = D² s_i.
+        # An ellipsoid: N_ij = (A_i² δ_ij − N_i N_j)/N, and Taylor to third order, with D_i = D² s_i.
         if face < 2:
             scale_a, scale_b = axis_scale(blob, h, 2, sign_a), axis_scale(blob, h, 4, sign_b)
         elif face < 4:
@@ -310,25 +313,32 @@ def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
         d = 1.0 / (1.0 - s)
         exact_a = d * (scale_a * a / norm + value * sa)
         exact_b = d * (scale_b * b / norm + value * sb)
-        aa_lo, aa_hi = _second(scale_a, na_lo, na_hi, na_lo, na_hi, n_lo, n_hi, d_lo, d_hi,
-                               sa_lo, sa_hi, sa_lo, sa_hi, saa - wide_h, saa + wide_h)  # fmt: skip
-        ab_lo, ab_hi = _second(0.0, na_lo, na_hi, nb_lo, nb_hi, n_lo, n_hi, d_lo, d_hi,
-                               sa_lo, sa_hi, sb_lo, sb_hi, sab - wide_h, sab + wide_h)  # fmt: skip
-        bb_lo, bb_hi = _second(scale_b, nb_lo, nb_hi, nb_lo, nb_hi, n_lo, n_hi, d_lo, d_hi,
-                               sb_lo, sb_hi, sb_lo, sb_hi, sbb - wide_h, sbb + wide_h)  # fmt: skip
-        cross = half_a * half_b * max(-ab_lo, ab_hi)
-        low = 0.5 * (min(aa_lo, 0.0) * half_a * half_a + min(bb_lo, 0.0) * half_b * half_b) - cross
-        high = 0.5 * (max(aa_hi, 0.0) * half_a * half_a + max(bb_hi, 0.0) * half_b * half_b) + cross
+        na, nb = scale_a * a / norm, scale_b * b / norm
+        aa = d * ((scale_a - na * na) / norm + d * (2.0 * na * sa + norm * (saa + 2.0 * d * sa * sa)))
+        bb = d * ((scale_b - nb * nb) / norm + d * (2.0 * nb * sb + norm * (sbb + 2.0 * d * sb * sb)))
+        ab = d * (-na * nb / norm + d * (na * sb + nb * sa + norm * (sab + 2.0 * d * sa * sb)))
+        # Beyond the Hessian: the third derivative, and the kinks where supports end.
+        r = math.sqrt(half_a * half_a + half_b * half_b)
+        s1 = math.sqrt(max(-sa_lo, sa_hi) ** 2 + max(-sb_lo, sb_hi) ** 2)
+        s2 = max(abs(saa), abs(sbb)) + abs(sab) + rest2 + r * rest3
+        n1 = math.sqrt(max(-na_lo, na_hi) ** 2 + max(-nb_lo, nb_hi) ** 2)
+        kink = n_hi * d_hi * d_hi * rest2
+        rise = r * _third(n_lo, n_hi, n1, max(scale_a, scale_b) / n_lo, d_hi, s1, s2, rest3)
+        bend_lo = min(aa, bb) - abs(ab) - (kink + rise) * (1.0 + 1e-9) - 1e-9 * abs(value)
+        bend_hi = max(aa, bb) + abs(ab) + (kink + rise) * (1.0 + 1e-9) + 1e-9 * abs(value)
+        cross = half_a * half_b * abs(ab) + r * r * (0.5 * kink + rise / 6.0)
+        low = 0.5 * (min(aa, 0.0) * half_a * half_a + min(bb, 0.0) * half_b * half_b) - cross
+        high = 0.5 * (max(aa, 0.0) * half_a * half_a + max(bb, 0.0) * half_b * half_b) + cross
         second = 0.5 * (high - low) * (1.0 + 1e-9) + 1e-11 * abs(value)
         if second < error:
             error = second
             slope_a, slope_b = exact_a, exact_b
             # The slopes are exact ones at the centre now; their spread by whichever bound is smaller.
-            wide_a = half_a * max(-aa_lo, aa_hi) + half_b * max(-ab_lo, ab_hi)
-            wide_b = half_a * max(-ab_lo, ab_hi) + half_b * max(-bb_lo, bb_hi)
+            wide_a = half_a * abs(aa) + half_b * abs(ab) + r * (kink + 0.5 * rise)
+            wide_b = half_a * abs(ab) + half_b * abs(bb) + r * (kink + 0.5 * rise)
             spread_a = min(wide_a * (1.0 + 1e-9), max(wa_hi - exact_a, exact_a - wa_lo)) + 1e-11 * abs(exact_a)
             spread_b = min(wide_b * (1.0 + 1e-9), max(wb_hi - exact_b, exact_b - wb_lo)) + 1e-11 * abs(exact_b)
             value += 0.5 * (low + high)
             reach = abs(slope_a) * half_a + abs(slope_b) * half_b + error
             w_lo, w_hi = max(w_lo, value - reach), min(w_hi, value + reach)
-    return value, slope_a, slope_b, error, spread_a, spread_b, w_lo, w_hi
+    return value, slope_a, slope_b, error, spread_a, spread_b, w_lo, w_hi, bend_lo, bend_hi

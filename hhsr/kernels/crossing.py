@@ -23,17 +23,20 @@ from hhsr.kernels.layout import (
     OWNER_RECORD,
     RETAINED,
     ROTATED,
+    VOXELS,
     integers,
     tables,
 )
 from hhsr.kernels.part import TRIANGLES, part_arrays, part_contains
 from hhsr.kernels.segment import PIECES, emit, leaf_crossings
 from hhsr.kernels.slab_segment import slab_crossings
-from hhsr.kernels.tree import contains_point, into_leaf, into_tree, turn_into_leaf
+from hhsr.kernels.tree import into_leaf, into_tree, turn_into_leaf
 from hhsr.kernels.triangle_build import STACK
 from hhsr.kernels.triangles import segment_crossings, sort_crossings
+from hhsr.kernels.voxels import leap, solid_contains
 
 SLOTS = 64  # pending tree nodes of one segment: three a level
+NUDGE = 1e-7  # mm past a voxel's border: less than voxels are proven beyond theirs
 MERGE = 1e-9  # mm: a leaving and an entering closer than this are one touch
 
 
@@ -94,22 +97,12 @@ def owner_crossings(
 
 
 @njit(cache=True, error_model="numpy")
-def follow_segment(
-    blob, ints, tab, root, px, py, pz, ex, ey, ez, resolution, tolerance, first, out, work, slots, pending
-):
-    """Return (start state, count) of the segment p → e in the tree's frame and the solid of node `root`.
-
-    t of each change of state goes to `out`.
-
-    first: stop after the first crossing. A count above out.size says how much room is needed.
-    """
-    dx, dy, dz = ex - px, ey - py, ez - pz
-    length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    begin = contains_point(blob, ints, tab, root, px, py, pz)
-    if length == 0.0:
-        return begin, 0
-    state, count = begin, 0
-    pending[0], slots[0, 0], slots[0, 1] = root, 0.0, 1.0
+def _follow_tree(
+    blob, ints, tab, root, px, py, pz, dx, dy, dz, begin, end, gap, resolution, tolerance, first, state, out, count, work,
+    slots, pending,
+):  # fmt: skip
+    """Follow p + t·d for t in [begin, end] by clipping down the tree; return (state, count, done)."""
+    pending[0], slots[0, 0], slots[0, 1] = root, begin, end
     depth = 1
     while depth > 0:
         depth -= 1
@@ -120,9 +113,9 @@ def follow_segment(
             state, count = owner_crossings(
                 blob, ints, tab, owner, px, py, pz, dx, dy, dz, t0, t1, resolution, tolerance, state, out, count, work
             )
-            count = _merge_touches(out, count, MERGE / length)
-            if first and count > 0 and out[0] < t1 - MERGE / length:
-                return begin, count
+            count = _merge_touches(out, count, gap)
+            if first and count > 0 and out[0] < t1 - gap:
+                return state, count, True
             continue
         f = ints[NODE_FLOATS] + NODE_FLOAT_SIZE * node
         h = blob[f] * px + blob[f + 1] * py + blob[f + 2] * pz - blob[f + 3]
@@ -152,9 +145,60 @@ def follow_segment(
         if near > t0:
             pending[depth], slots[depth, 0], slots[depth, 1] = one, t0, min(near, t1)
             depth += 1
+    return state, count, False
+
+
+@njit(cache=True, error_model="numpy")
+def follow_segment(
+    blob, ints, tab, root, px, py, pz, ex, ey, ez, resolution, tolerance, first, out, work, slots, pending
+):
+    """Return (start state, count) of the segment p → e in the tree's frame and the solid of node `root`.
+
+    t of each change of state goes to `out`. Where the voxels prove the state nothing else is asked.
+
+    first: stop after the first crossing. A count above out.size says how much room is needed.
+    """
+    dx, dy, dz = ex - px, ey - py, ez - pz
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    begin = solid_contains(blob, ints, tab, root, px, py, pz)
+    if length == 0.0:
+        return begin, 0
+    state, count = begin, 0
+    gap = MERGE / length
+    done = False
+    if root != 0 or ints[VOXELS] == 0:
+        state, count, done = _follow_tree(
+            blob, ints, tab, root, px, py, pz, dx, dy, dz, 0.0, 1.0, gap, resolution, tolerance, first, state, out, count,
+            work, slots, pending,
+        )  # fmt: skip
+    else:
+        nudge = max(NUDGE / length, 1e-15)
+        t, since = 0.0, -1.0
+        while t < 1.0 and not done:
+            proven, end = leap(blob, ints, px, py, pz, dx, dy, dz, t)
+            if proven == 0:
+                since = t if since < 0.0 else since
+            elif since >= 0.0:
+                state, count, done = _follow_tree(
+                    blob, ints, tab, root, px, py, pz, dx, dy, dz, since, t, gap, resolution, tolerance, first, state,
+                    out, count, work, slots, pending,
+                )  # fmt: skip
+                since = -1.0
+            if proven != 0 and not done:
+                state, count = emit(state, proven > 0, t, out, count)
+                count = _merge_touches(out, count, gap)
+                done = first and count > 0
+            t = max(end, t) + nudge
+        if since >= 0.0 and not done:
+            state, count, done = _follow_tree(
+                blob, ints, tab, root, px, py, pz, dx, dy, dz, since, 1.0, gap, resolution, tolerance, first, state, out,
+                count, work, slots, pending,
+            )  # fmt: skip
+    if done:
+        return begin, count
     if count <= out.shape[0]:
-        _, count = emit(state, contains_point(blob, ints, tab, root, ex, ey, ez), 1.0, out, count)
-        count = _merge_touches(out, count, MERGE / length)
+        _, count = emit(state, solid_contains(blob, ints, tab, root, ex, ey, ez), 1.0, out, count)
+        count = _merge_touches(out, count, gap)
     return begin, count
 
 

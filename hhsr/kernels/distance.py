@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from hhsr.kernels.crossing import follow_segment, scratch
+from hhsr.kernels.foot import foot_in_chart
 from hhsr.kernels.layout import (
     EDGE_COUNT,
     EDGE_FLOATS,
@@ -33,13 +34,14 @@ from hhsr.kernels.nearest import (
     BEST_T,
     FAR,
     FOOT,
+    LATE,
     LENGTH2,
     NODE_ROOM,
     SEARCH_SIZE,
     START,
     TOLERANCE,
     VECTOR,
-    nearest_on_leaf,
+    nearest_on_leaves,
     offer,
     owner_planes,
 )
@@ -47,14 +49,13 @@ from hhsr.kernels.nearest_part import box_bound, nearest_on_part
 from hhsr.kernels.nearest_slab import nearest_on_slab
 from hhsr.kernels.polygon import ROOM, segment_to_segment
 from hhsr.kernels.tree import (
-    contains_point,
     into_leaf,
     into_tree,
     out_of_tree,
     owner_of,
-    turn_into_leaf,
     turn_out_of_leaf,
 )
+from hhsr.kernels.voxels import solid_contains
 
 SIDE = 1e-6  # mm: how far off a plane its two sides are asked
 
@@ -63,13 +64,13 @@ SIDE = 1e-6  # mm: how far off a plane its two sides are asked
 def near_scratch():
     """Return (search, local, nodes, keys, corners, spare, rects): what one thread needs for a search."""
     return (
-        np.empty(SEARCH_SIZE),
-        np.empty(SEARCH_SIZE),
-        np.empty(NODE_ROOM, dtype=np.int64),
-        np.empty(NODE_ROOM),
+        np.zeros(SEARCH_SIZE),
+        np.zeros(SEARCH_SIZE),
+        np.empty(LATE + NODE_ROOM, dtype=np.int64),
+        np.empty(LATE + NODE_ROOM),
         np.empty((ROOM, 3)),
         np.empty((ROOM, 3)),
-        np.empty((NODE_ROOM, 4)),
+        np.empty((NODE_ROOM, 6)),
     )
 
 
@@ -85,25 +86,14 @@ def set_search(search, px, py, pz, dx, dy, dz, tolerance):
 
 
 @njit(cache=True, error_model="numpy")
-def _nearest_on_owner(blob, ints, tab, owner, search, local, nodes, keys, corners, spare, rects):
+def _nearest_on_owner(blob, ints, owner, search, nodes, keys, corners, spare, rects):
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
     kind, record = ints[o + OWNER_KIND], ints[o + OWNER_RECORD]
     planes, count = owner_planes(ints, o)
     if kind == RETAINED:
         nearest_on_part(blob, ints, record, planes, count, search, nodes, keys, corners, spare)
-        return
-    if kind != MODEL:
+    else:
         nearest_on_slab(blob, ints, record, planes, count, search, corners, spare, rects)
-        return
-    frame = ints[record + FRAME]
-    qx, qy, qz = into_leaf(blob, ints, record, search[START], search[START + 1], search[START + 2])
-    dx, dy, dz = turn_into_leaf(blob, frame, search[VECTOR], search[VECTOR + 1], search[VECTOR + 2])
-    set_search(local, qx, qy, qz, dx, dy, dz, search[TOLERANCE])
-    local[LENGTH2], local[BEST] = search[LENGTH2], search[BEST]
-    nearest_on_leaf(blob, ints, tab, record, planes, count, local, nodes, keys, corners, spare, rects)
-    if local[BEST] < search[BEST]:
-        x, y, z = turn_out_of_leaf(blob, frame, local[FOOT], local[FOOT + 1], local[FOOT + 2])
-        offer(search, local[BEST], local[BEST_T], x + blob[frame], y + blob[frame + 1], z + blob[frame + 2])
 
 
 @njit(cache=True, error_model="numpy")
@@ -119,7 +109,7 @@ def _nearest_step(blob, ints, tab, search):
             h = nx * px + ny * py + nz * pz - blob[o + 3]
             if abs(h) < search[BEST]:
                 x, y, z = px - h * nx, py - h * ny, pz - h * nz
-                if contains_point(blob, ints, tab, 0, x + SIDE * nx, y + SIDE * ny, z + SIDE * nz) != contains_point(
+                if solid_contains(blob, ints, tab, 0, x + SIDE * nx, y + SIDE * ny, z + SIDE * nz) != solid_contains(
                     blob, ints, tab, 0, x - SIDE * nx, y - SIDE * ny, z - SIDE * nz
                 ):
                     offer(search, abs(h), float(end), x, y, z)
@@ -145,19 +135,38 @@ def _nearest_step(blob, ints, tab, search):
 
 
 @njit(cache=True, error_model="numpy")
+def _by_chart(blob, ints, tab, search, local):
+    """Offer the foot of a point in the chart of its own leaf; return whether that is proven to be the nearest."""
+    px, py, pz = search[START], search[START + 1], search[START + 2]
+    owner = owner_of(blob, ints, 0, px, py, pz)
+    o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
+    if ints[o + OWNER_KIND] != MODEL:
+        return False
+    leaf = ints[o + OWNER_RECORD]
+    px, py, pz = into_leaf(blob, ints, leaf, px, py, pz)
+    foot = local[FOOT : FOOT + 3]
+    distance, proven = foot_in_chart(blob, ints, tab, owner, px, py, pz, search[TOLERANCE], foot)
+    if distance < search[BEST]:
+        frame = ints[leaf + FRAME]
+        x, y, z = turn_out_of_leaf(blob, frame, foot[0], foot[1], foot[2])
+        offer(search, distance, 0.0, x + blob[frame], y + blob[frame + 1], z + blob[frame + 2])
+    return proven
+
+
+@njit(cache=True, error_model="numpy")
 def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects):
     """Find the surface point nearest to the search's segment, to its tolerance: truth ∈ [best − tolerance, best]."""
-    owners = ints[OWNER_COUNT]
-    home = owner_of(blob, ints, 0, search[START], search[START + 1], search[START + 2])
-    _nearest_on_owner(blob, ints, tab, home, search, local, nodes, keys, corners, spare, rects)
+    if search[LENGTH2] == 0.0 and _by_chart(blob, ints, tab, search, local):
+        return
+    nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
     _nearest_step(blob, ints, tab, search)
-    for owner in range(owners):
-        if owner == home:
-            continue
+    for owner in range(ints[OWNER_COUNT]):
         o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
+        if ints[o + OWNER_KIND] == MODEL:
+            continue
         box = blob[ints[o + OWNER_BOX] : ints[o + OWNER_BOX] + 6]
         if box[0] <= box[3] and box_bound(box, search) < search[BEST] - search[TOLERANCE]:
-            _nearest_on_owner(blob, ints, tab, owner, search, local, nodes, keys, corners, spare, rects)
+            _nearest_on_owner(blob, ints, owner, search, nodes, keys, corners, spare, rects)
     if search[BEST] == FAR:
         search[BEST] = np.inf
 
@@ -180,7 +189,7 @@ def nearest_many(blob, points, tolerance, distance, foot):
         x, y, z = into_tree(blob, ints, points[i, 0], points[i, 1], points[i, 2])
         set_search(search, x, y, z, 0.0, 0.0, 0.0, tolerance)
         search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
-        distance[i] = -search[BEST] if contains_point(blob, ints, tab, 0, x, y, z) else search[BEST]
+        distance[i] = -search[BEST] if solid_contains(blob, ints, tab, 0, x, y, z) else search[BEST]
         foot[i, 0], foot[i, 1], foot[i, 2] = out_of_tree(blob, ints, search[FOOT], search[FOOT + 1], search[FOOT + 2])
     return bad
 

@@ -15,7 +15,13 @@ EDGE_COUNT, EDGE_FLOATS = 6, 7
 PLANE_COUNT, PLANE_FLOATS = 8, 9
 POSE = 10  # float slot: rotation (9) and translation (3), tree frame to LPS
 LOWEST, HIGHEST = 11, 12  # float slots of the box of the solid, tree frame
-HEADER_SIZE = 16
+# Facets (hhsr.kernels.facets): how many, integer slot of their codes, integer slot of (levels, then start among the float32
+# tables and number of nodes of each).
+FACET_COUNT, FACET_CODES, FACET_LEVELS = 13, 14, 15
+# Voxels (hhsr.kernels.voxels): integer slot of (nx, ny, nz), float slot of (lowest corner 3, side, 1/side), slot of the
+# bytes; 0 where there are none.
+VOXELS, VOXEL_FRAME, VOXEL_BYTES = 16, 17, 18
+HEADER_SIZE = 20
 
 # Nodes: 4 integers (kind, left, right, owner), 8 floats (normal 3, offset, half width).
 CUT, MODEL, RETAINED, SLAB = 0, 1, 2, 3
@@ -27,20 +33,27 @@ OWNER_KIND, OWNER_RECORD, OWNER_PLANES, OWNER_PLANE_FLOATS, OWNER_NODE, OWNER_BO
 
 # Model leaf record, integers: where its numbers (float slots), lists (integer slots) and tables (float32 slots) lie.
 HALF_AXES, AZIMUTH, AZIMUTH_COUNT, ELEVATION, ELEVATION_COUNT = 0, 1, 2, 3, 4
-CENTRES, CENTRE_COUNT = 5, 6  # rows of 5: unit vector, 1/(1 − cos σ), weight
-BLOCKS = 7  # 6·8·8 + 1 integer offsets, into the centres that are not 0 everywhere in a block of directions
+# The centres that are not 0 everywhere in a block of directions, copied for each block: float slot of all blocks' data,
+# and integer slots of 6·8·8 + 1 offsets into it. A block holds 5 rows, each as long as it has centres, padded with zeros
+# to a multiple of LANES: unit vector x, y, z; 1/(1 − cos σ); weight.
+BLOCK_DATA, BLOCKS = 5, 7
+CELL_BITS = 6  # log₂ of the base cells a face side
 FRAME, ROTATED = 8, 9  # float slots: centre 3, rotation 9 (leaf to tree)
-CELLS, CELL_TABLE, RANGE_TABLE, SPHERE_TABLE = 10, 11, 12, 13
+# Cube map: base cells a face side; integer slot of one word a base cell, `first cell · 16 + 8 · surface + k` where it is
+# parted into 2^k × 2^k cells, and has surface in the leaf's region or not; float32 slots of the cells and of the pyramid of ranges.
+CELLS, PARTING, CELL_TABLE, RANGE_TABLE = 10, 11, 12, 13
+BEND_TABLE = 15  # float32 slot of the bend of each base cell, lowest and highest
 BOX = 14  # float slots: box of the leaf in its own frame 6, least and greatest |p|∞ of its surface
 LEAF_INT_SIZE = 16
-CENTRE_SIZE = 5
+BLOCK_ROWS = 5
+LANES = 8
 BLOCKS_PER_SIDE = 8
-BLOCK_COUNT = 6 * BLOCKS_PER_SIDE * BLOCKS_PER_SIDE
 
-# A cell of the finest level: |W − (value + slope_a·δa + slope_b·δb)| ≤ error, |∂W/∂a − slope_a| ≤ spread_a, same for b;
-# its surface lies within `radius` (mm) of dir(a, b)/value.
+# A cell: |W − (value + slope_a·δa + slope_b·δb)| ≤ error, |∂W/∂a − slope_a| ≤ spread_a, same for b.
+# The eigenvalues of ∂²W lie in [bend_lo, bend_hi].
 CELL_SIZE = 8
-VALUE, SLOPE_A, SLOPE_B, ERROR, SPREAD_A, SPREAD_B, RADIUS = 0, 1, 2, 3, 4, 5, 6
+VALUE, SLOPE_A, SLOPE_B, ERROR, SPREAD_A, SPREAD_B, BEND_LO, BEND_HI = 0, 1, 2, 3, 4, 5, 6, 7
+FINEST_PARTING = 4  # a facet's code has eight bits for the cell
 
 
 @njit(cache=True, error_model="numpy")

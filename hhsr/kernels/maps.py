@@ -1,7 +1,7 @@
-"""The certified cube map of a leaf: linear models of its cells, and a pyramid of ranges and of enclosing spheres.
+"""The certified cube map of a leaf: linear models of its cells, and a pyramid of ranges over the base cells.
 
-Tables are float32, rounded outward. The finest level has `cells`² cells a face; the pyramid holds the levels
-cells/2, …, 2, 1 one after another, finest first, each as (face, i, j).
+A face has n² base cells, each parted into 2^k × 2^k cells where the surface needs it. Tables are float32, rounded outward.
+The pyramid holds the levels n, n/2, …, 2, 1 one after another, finest first, each as (face, i, j).
 """
 
 import math
@@ -11,9 +11,16 @@ from numba import njit
 
 from hhsr.kernels.cell import cell_model, direction_of
 from hhsr.kernels.layout import (
+    BEND_HI,
+    BEND_LO,
+    BLOCK_ROWS,
     BLOCKS_PER_SIDE,
+    CELL_SIZE,
+    CELL_TABLE,
+    CELLS,
     ERROR,
-    RADIUS,
+    LANES,
+    PARTING,
     SLOPE_A,
     SLOPE_B,
     SPREAD_A,
@@ -23,13 +30,14 @@ from hhsr.kernels.layout import (
 )
 
 UP = 1.0 + 3e-7  # more than one float32 rounding
+STEEP = 1e3  # mm: thickness given to a cell that faces its centre too obliquely to have a tangent plane
 
 
 @njit(cache=True, error_model="numpy")
 def level_start(cells, side):
-    """Return the index of the first pyramid node of the level with `side` cells a face side."""
+    """Return the index of the first pyramid node of the level with `side` base cells a face side."""
     start = 0
-    k = cells // 2
+    k = cells
     while k > side:
         start += 6 * k * k
         k //= 2
@@ -38,8 +46,22 @@ def level_start(cells, side):
 
 @njit(cache=True, error_model="numpy")
 def pyramid_size(cells):
-    """Return how many nodes the pyramid above `cells`² cells a face has."""
+    """Return how many nodes the pyramid over `cells`² base cells a face has."""
     return level_start(cells, 1) + 6
+
+
+@njit(cache=True, error_model="numpy")
+def cell_at(ints, leaf, face, a, b):
+    """Return (slot, a, b, half) of the cell that holds (a, b): its float32 slot, its centre and half its side."""
+    n = ints[leaf + CELLS]
+    u, v = (a + 1.0) * 0.5 * n, (b + 1.0) * 0.5 * n
+    i, j = min(max(int(u), 0), n - 1), min(max(int(v), 0), n - 1)
+    word = ints[ints[leaf + PARTING] + (face * n + i) * n + j]
+    s = 1 << (word & 7)
+    p, q = min(max(int((u - i) * s), 0), s - 1), min(max(int((v - j) * s), 0), s - 1)
+    half = 1.0 / (n * s)
+    slot = ints[leaf + CELL_TABLE] + CELL_SIZE * ((word >> 4) + p * s + q)
+    return slot, (2 * (i * s + p) + 1) * half - 1.0, (2 * (j * s + q) + 1) * half - 1.0, half
 
 
 @njit(cache=True, error_model="numpy")
@@ -49,8 +71,51 @@ def quad_radius_ok(value, slope_a, slope_b, error, half_a, half_b):
 
 
 @njit(cache=True, error_model="numpy")
+def plane_of(face, a, b, value, slope_a, slope_b):
+    """Return g of the plane g·p = 1 that is a cell's linear model of W in space, leaf frame."""
+    c = value - slope_a * a - slope_b * b
+    if face % 2 == 1:
+        c = -c
+    if face < 2:
+        return c, slope_a, slope_b
+    if face < 4:
+        return slope_b, c, slope_a
+    return slope_a, slope_b, c
+
+
+@njit(cache=True, error_model="numpy")
+def cell_corners(face, a, b, half, value, slope_a, slope_b, corners):
+    """Fill corners (ROOM, 3)[:4] of a cell's flat quad, leaf frame."""
+    for corner in range(4):
+        da = half if corner == 1 or corner == 2 else -half
+        db = half if corner >= 2 else -half
+        x, y, z = direction_of(face, a + da, b + db)
+        m = 1.0 / (value + slope_a * da + slope_b * db)
+        corners[corner, 0], corners[corner, 1], corners[corner, 2] = x * m, y * m, z * m
+
+
+@njit(cache=True, error_model="numpy")
+def quad_radius(face, a, b, half, value, slope_a, slope_b):
+    """Return a bound of how far (mm) any point of a cell's flat quad lies from dir(a, b)/value.
+
+    With δ = (da, db, 0) and T the model at its end: dir/T − dir₀/value = (δ value − dir₀ (T − value))/(value·T).
+    """
+    turn = abs(slope_a) + abs(slope_b)
+    length = math.sqrt(1.0 + a * a + b * b)
+    return half * (1.4142136 * value + length * turn) / (value * (value - turn * half)) * (1.0 + 1e-9)
+
+
+@njit(cache=True, error_model="numpy")
 def model_thickness(face, a, b, half_a, half_b, value, slope_a, slope_b, error):
-    """Return how far (mm) surface and tangent plane of a cell can lie apart along a ray: |dir|·e / (T·(T − e))."""
+    """Return how far (mm) a cell's surface can lie from its plane: m·|W − model|/|g|, m = 1/W ≤ 1/(lowest − error)."""
+    gx, gy, gz = plane_of(face, a, b, value, slope_a, slope_b)
+    low = value - abs(slope_a) * half_a - abs(slope_b) * half_b
+    return error / ((low - error) * math.sqrt(gx * gx + gy * gy + gz * gz)) * (1.0 + 1e-9)
+
+
+@njit(cache=True, error_model="numpy")
+def ray_thickness(face, a, b, half_a, half_b, value, slope_a, slope_b, error):
+    """Return how far (mm) surface and plane of a cell can lie apart along a ray: |dir|·e / (T·(T − e))."""
     reach_a, reach_b = abs(a) + half_a, abs(b) + half_b
     low = value - abs(slope_a) * half_a - abs(slope_b) * half_b
     return math.sqrt(1.0 + reach_a * reach_a + reach_b * reach_b) * error / (low * (low - error)) * (1.0 + 1e-9)
@@ -59,11 +124,8 @@ def model_thickness(face, a, b, half_a, half_b, value, slope_a, slope_b, error):
 @njit(cache=True, error_model="numpy")
 def cell_sphere(face, a, b, half_a, half_b, value, slope_a, slope_b, error, lo, hi):
     """Return (x, y, z, radius) of a sphere about dir(a, b)/value, leaf frame, that encloses the surface of a cell."""
-    if quad_radius_ok(value, slope_a, slope_b, error, half_a, half_b):
-        grow = model_thickness(face, a, b, half_a, half_b, value, slope_a, slope_b, error)
-        flat = True
-    else:
-        grow, flat = 0.0, False
+    flat = quad_radius_ok(value, slope_a, slope_b, error, half_a, half_b)
+    grow = ray_thickness(face, a, b, half_a, half_b, value, slope_a, slope_b, error) if flat else 0.0
     cx, cy, cz = direction_of(face, a, b)
     cx, cy, cz = cx / value, cy / value, cz / value
     radius = 0.0
@@ -78,31 +140,117 @@ def cell_sphere(face, a, b, half_a, half_b, value, slope_a, slope_b, error, lo, 
     return cx, cy, cz, (radius + grow) * (1.0 + 1e-9)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def build_map(blob, leaf, cells, models, ranges, spheres, box):
-    """Fill the tables of one leaf and its box: (8,) lowest 3, highest 3, least and greatest |p|∞ of its surface.
+@njit(cache=True, error_model="numpy")
+def outside_region(blob, planes, count, x, y, z, radius):
+    """Return whether a ball lies wholly outside the region of `count` planes n·p ≤ c from float slot `planes` on."""
+    for k in range(count):
+        o = planes + 4 * k
+        if blob[o] * x + blob[o + 1] * y + blob[o + 2] * z - blob[o + 3] > radius:
+            return True
+    return False
 
-    models: (6, cells, cells, CELL_SIZE) float32. ranges: (nodes, 2) float32. spheres: (nodes, 4) float32.
+
+@njit(cache=True, error_model="numpy")
+def _write(out, value, ga, gb, error, half, da, db, bend_lo, bend_hi):
+    out[VALUE], out[SLOPE_A], out[SLOPE_B] = value, ga, gb
+    out[SPREAD_A], out[SPREAD_B] = (da + 1e-7 * abs(ga)) * UP, (db + 1e-7 * abs(gb)) * UP
+    out[ERROR] = (error + 1e-7 * (value + (abs(ga) + abs(gb)) * half)) * UP
+    out[BEND_LO], out[BEND_HI] = bend_lo - 3e-7 * abs(bend_lo), bend_hi + 3e-7 * abs(bend_hi)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def prove_base(blob, leaf, n, planes, count, models, spans, thickness):
+    """Prove the base cells of a leaf.
+
+    models: (6, n, n, CELL_SIZE) float32. spans: (6, n, n, 2) range of W. thickness: (6, n, n) mm, how far surface and plane
+    can lie apart in the thickest of a cell's four quarters; 0 where the surface lies outside the leaf's region, so that
+    nothing asks for it.
     """
     ints = integers(blob)
-    half = 1.0 / cells
-    fine = np.empty((cells, cells, 4))
-    span = np.empty((cells, cells, 2))
+    half = 1.0 / n
+    for face in range(6):
+        for i in range(n):
+            for j in range(n):
+                a, b = (2 * i + 1) * half - 1.0, (2 * j + 1) * half - 1.0
+                value, ga, gb, error, da, db, lo, hi, b0, b1 = cell_model(
+                    blob, ints, leaf, face, a, b, half, half
+                )
+                _write(models[face, i, j], value, ga, gb, error, half, da, db, b0, b1)
+                spans[face, i, j, 0], spans[face, i, j, 1] = lo, hi
+                x, y, z, radius = cell_sphere(face, a, b, half, half, value, ga, gb, error, lo, hi)
+                if outside_region(blob, planes, count, x, y, z, radius):
+                    thickness[face, i, j] = 0.0
+                    continue
+                worst = 0.0
+                for q in range(4):
+                    ca, cb = a + (0.5 * half if q & 1 else -0.5 * half), b + (0.5 * half if q & 2 else -0.5 * half)
+                    value, ga, gb, error, _, _, lo, hi, _, _ = cell_model(
+                        blob, ints, leaf, face, ca, cb, 0.5 * half, 0.5 * half
+                    )
+                    x, y, z, radius = cell_sphere(face, ca, cb, 0.5 * half, 0.5 * half, value, ga, gb, error, lo, hi)
+                    if outside_region(blob, planes, count, x, y, z, radius):
+                        continue
+                    if quad_radius_ok(value, ga, gb, error, 0.5 * half, 0.5 * half):
+                        thick = model_thickness(face, ca, cb, 0.5 * half, 0.5 * half, value, ga, gb, error)
+                        worst = max(worst, min(thick, STEEP))
+                    else:
+                        worst = STEEP
+                thickness[face, i, j] = worst
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def prove_cells(blob, leaf, n, parting, models, spans, cells, bends):
+    """Prove the cells of every parted base cell, and narrow its span by theirs.
+
+    parting: (6, n, n) words (`hhsr.kernels.layout`). models: of the base cells, used as they are where k = 0. cells:
+    (…, CELL_SIZE) float32. bends: (6, n, n, 2) float32, the bend of each base cell.
+    """
+    ints = integers(blob)
+    for face in range(6):
+        for i in range(n):
+            for j in range(n):
+                first, k = parting[face, i, j] >> 4, parting[face, i, j] & 7
+                if k == 0:
+                    for q in range(CELL_SIZE):
+                        cells[first, q] = models[face, i, j, q]
+                    bends[face, i, j, 0], bends[face, i, j, 1] = cells[first, BEND_LO], cells[first, BEND_HI]
+                    continue
+                s = 1 << k
+                half = 1.0 / (n * s)
+                low, high = 1e300, 0.0
+                bends[face, i, j, 0], bends[face, i, j, 1] = np.inf, -np.inf
+                for p in range(s):
+                    for q in range(s):
+                        a, b = (2 * (i * s + p) + 1) * half - 1.0, (2 * (j * s + q) + 1) * half - 1.0
+                        value, ga, gb, error, da, db, lo, hi, b0, b1 = cell_model(
+                    blob, ints, leaf, face, a, b, half, half
+                )
+                        _write(cells[first + p * s + q], value, ga, gb, error, half, da, db, b0, b1)
+                        low, high = min(low, lo), max(high, hi)
+                        cell = cells[first + p * s + q]
+                        bends[face, i, j, 0] = min(bends[face, i, j, 0], cell[BEND_LO])
+                        bends[face, i, j, 1] = max(bends[face, i, j, 1], cell[BEND_HI])
+                spans[face, i, j, 0], spans[face, i, j, 1] = max(spans[face, i, j, 0], low), min(
+                    spans[face, i, j, 1], high
+                )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_ranges(n, spans, ranges, box):
+    """Fill the pyramid of ranges (nodes, 2) float32 from the spans of the base cells, and the leaf's box.
+
+    box: (8,) lowest 3, highest 3, least and greatest |p|∞ of its surface, leaf frame.
+    """
+    half = 1.0 / n
     box[:3], box[3:6], box[6], box[7] = 0.0, 0.0, 1e300, 0.0
     for face in range(6):
-        for i in range(cells):
-            for j in range(cells):
-                a, b = (2 * i + 1) * half - 1.0, (2 * j + 1) * half - 1.0
-                value, ga, gb, error, da, db, lo, hi = cell_model(blob, ints, leaf, face, a, b, half, half)
-                out = models[face, i, j]
-                out[VALUE], out[SLOPE_A], out[SLOPE_B] = value, ga, gb
-                out[SPREAD_A], out[SPREAD_B] = (da + 1e-7 * abs(ga)) * UP, (db + 1e-7 * abs(gb)) * UP
-                out[ERROR] = (error + 1e-7 * (value + (abs(ga) + abs(gb)) * half)) * UP
-                span[i, j, 0], span[i, j, 1] = lo, hi
-                cx, cy, cz, radius = cell_sphere(face, a, b, half, half, value, ga, gb, error, lo, hi)
-                out[RADIUS] = (radius + 1e-7 * (abs(cx) + abs(cy) + abs(cz))) * UP
-                fine[i, j, 0], fine[i, j, 1], fine[i, j, 2], fine[i, j, 3] = cx, cy, cz, radius
+        for i in range(n):
+            for j in range(n):
+                lo, hi = spans[face, i, j, 0], spans[face, i, j, 1]
+                node = (face * n + i) * n + j
+                ranges[node, 0], ranges[node, 1] = lo * (1.0 - 3e-7), hi * UP
                 box[6], box[7] = min(box[6], 1.0 / hi), max(box[7], 1.0 / lo)
+                a, b = (2 * i + 1) * half - 1.0, (2 * j + 1) * half - 1.0
                 for corner in range(4):
                     x, y, z = direction_of(
                         face, a + (half if corner & 1 else -half), b + (half if corner & 2 else -half)
@@ -110,34 +258,24 @@ def build_map(blob, leaf, cells, models, ranges, spheres, box):
                     box[0], box[3] = min(box[0], x / lo), max(box[3], x / lo)
                     box[1], box[4] = min(box[1], y / lo), max(box[4], y / lo)
                     box[2], box[5] = min(box[2], z / lo), max(box[5], z / lo)
-        side = cells // 2
+        side = n // 2
         while side >= 1:
-            step = cells // side
-            start = level_start(cells, side) + face * side * side
+            below, start = level_start(n, 2 * side) + 4 * face * side * side, level_start(n, side) + face * side * side
             for i in range(side):
                 for j in range(side):
-                    lo, hi = 1e300, 0.0
-                    cx = cy = cz = 0.0
-                    for k in range(i * step, (i + 1) * step):
-                        for m in range(j * step, (j + 1) * step):
-                            lo, hi = min(lo, span[k, m, 0]), max(hi, span[k, m, 1])
-                            cx, cy, cz = cx + fine[k, m, 0], cy + fine[k, m, 1], cz + fine[k, m, 2]
-                    count = step * step
-                    cx, cy, cz = np.float32(cx / count), np.float32(cy / count), np.float32(cz / count)
-                    radius = 0.0
-                    for k in range(i * step, (i + 1) * step):
-                        for m in range(j * step, (j + 1) * step):
-                            d = (fine[k, m, 0] - cx) ** 2 + (fine[k, m, 1] - cy) ** 2 + (fine[k, m, 2] - cz) ** 2
-                            radius = max(radius, math.sqrt(d) + fine[k, m, 3])
-                    node = start + i * side + j
-                    ranges[node, 0], ranges[node, 1] = lo * (1.0 - 3e-7), hi * UP
-                    spheres[node, 0], spheres[node, 1], spheres[node, 2] = cx, cy, cz
-                    spheres[node, 3] = radius * UP
+                    lo, hi = np.float32(1e30), np.float32(0.0)
+                    for q in range(4):
+                        child = below + (2 * i + (q >> 1)) * 2 * side + 2 * j + (q & 1)
+                        lo, hi = min(lo, ranges[child, 0]), max(hi, ranges[child, 1])
+                    ranges[start + i * side + j, 0], ranges[start + i * side + j, 1] = lo, hi
             side //= 2
 
 
-def blocks_of(centres, inverse_extents):
-    """Return (offsets (385,), index) of the centres that are not 0 everywhere in each block of directions."""
+def blocks_of(centres, inverse_extents, weights):
+    """Return (offsets (385,), rows (…,)): for each block of directions the centres that are not 0 everywhere in it.
+
+    Layout of a block: `hhsr.kernels.layout.BLOCKS`.
+    """
     step = 2.0 / BLOCKS_PER_SIDE
     edges = -1.0 + step * np.arange(BLOCKS_PER_SIDE + 1)
     grid = np.array([[[direction_of(f, a, b) for b in edges] for a in edges] for f in range(6)])
@@ -152,5 +290,11 @@ def blocks_of(centres, inverse_extents):
     angle = np.arccos(np.clip(middle.reshape(-1, 3) @ centres.T, -1.0, 1.0))
     support = np.arccos(np.clip(1.0 - 1.0 / inverse_extents, -1.0, 1.0)) + 1e-6
     near = angle <= reach[:, None] + support
-    offsets = np.concatenate([[0], np.cumsum(near.sum(axis=1))])
-    return offsets.astype(np.int64), np.nonzero(near)[1].astype(np.int64)
+    table = np.column_stack([centres, inverse_extents, weights]).T
+    blocks = []
+    for held in near:
+        rows = np.zeros((BLOCK_ROWS, -(-int(held.sum()) // LANES) * LANES))
+        rows[:, : held.sum()] = table[:, held]
+        blocks.append(rows.ravel())
+    offsets = np.concatenate([[0], np.cumsum([rows.size for rows in blocks])])
+    return offsets.astype(np.int64), np.concatenate(blocks)

@@ -1,9 +1,8 @@
-"""The nearest point of one owner's surface to a segment (a point is a segment of no length): branch and bound.
+"""The point of the model leaves' surface nearest to a segment (a point is a segment of no length): branch and bound.
 
-A search is a float array: SEARCH_* slots hold the segment in the owner's frame, and the best point so far. A node of
-the cube map is discarded when its enclosing sphere, cut off by no plane of the region, lies no nearer than the best
-point less the tolerance; a cell when its flat quad, clipped to the region and widened by its proven thickness, does;
-what is left is parted, down to the tolerance.
+A search is a float array: its slots hold the segment and the best point so far. A node of the facets' hierarchy is
+discarded when its disc lies no nearer than the best point less the tolerance; a facet when its flat quad, clipped to the
+region and widened by its proven thickness, does; what is left is parted, down to the tolerance.
 """
 
 import math
@@ -11,28 +10,46 @@ import math
 import numpy as np
 from numba import njit
 
-from hhsr.kernels.cell import cell_model, chart_of, direction_of, inverse_radius
+from hhsr.kernels.cell import cell_model, chart_of, direction_of, face_of, inverse_radius
+from hhsr.kernels.facets import DISC_SIZE, FAN, RADIUS, THICK, facet_cell
+from hhsr.kernels.foot import ball_is_free, step_to_foot
+from hhsr.kernels.jet import has_jets, inverse_radius_jet
 from hhsr.kernels.layout import (
+    BEND_HI,
+    BEND_LO,
     BOX,
-    CELL_SIZE,
-    CELL_TABLE,
-    CELLS,
     ERROR,
+    FACET_CODES,
+    FACET_COUNT,
+    FACET_LEVELS,
+    FRAME,
+    OWNER_INT_SIZE,
+    OWNER_INTS,
     OWNER_PLANE_FLOATS,
     OWNER_PLANES,
-    RADIUS,
+    OWNER_RECORD,
     SLOPE_A,
     SLOPE_B,
-    SPHERE_TABLE,
     VALUE,
 )
-from hhsr.kernels.maps import cell_sphere, level_start, model_thickness, quad_radius_ok
+from hhsr.kernels.maps import (
+    cell_corners,
+    cell_sphere,
+    model_thickness,
+    outside_region,
+    plane_of,
+    quad_radius,
+    quad_radius_ok,
+    ray_thickness,
+)
 from hhsr.kernels.polygon import clip_polygon, polygon_to_segment
+from hhsr.kernels.tree import into_leaf, turn_into_leaf, turn_out_of_leaf
 
 # Slots of a search: start 3, vector 3, squared length; best distance, t, point 3 (owner's frame); tolerance.
 START, VECTOR, LENGTH2, BEST, BEST_T, FOOT, TOLERANCE = 0, 3, 6, 7, 8, 9, 12
 SEARCH_SIZE = 16
-NODE_ROOM = 256
+LATE = 256  # room for pending nodes
+NODE_ROOM = 256  # room for facets to be settled, and for parts of one
 FAR = 1e150  # mm: no surface point found yet; finite, so that "no surface here" (infinite) is beyond it
 FINEST = 1e-5  # mm: a piece of surface smaller than this is taken as a point
 
@@ -55,16 +72,6 @@ def offer(search, distance, t, x, y, z):
     if distance < search[BEST]:
         search[BEST], search[BEST_T] = distance, t
         search[FOOT], search[FOOT + 1], search[FOOT + 2] = x, y, z
-
-
-@njit(cache=True, error_model="numpy")
-def outside_region(blob, planes, count, x, y, z, radius):
-    """Return whether a ball lies wholly outside the region."""
-    for k in range(count):
-        o = planes + 4 * k
-        if blob[o] * x + blob[o + 1] * y + blob[o + 2] * z - blob[o + 3] > radius:
-            return True
-    return False
 
 
 @njit(cache=True, error_model="numpy")
@@ -95,50 +102,49 @@ def offer_patch_point(blob, ints, leaf, planes, count, search, face, x, y, z, sh
 
 
 @njit(cache=True, error_model="numpy")
-def cell_bound(
-    blob, ints, leaf, planes, count, search, face, a, b, half_a, half_b, value, ga, gb, error, corners, spare
-):
+def cell_bound(blob, ints, leaf, planes, count, search, face, a, b, half, value, ga, gb, error, corners, spare):
     """Return a lower bound of the segment's distance to the cell's surface in the region; offer a point of it.
 
     Infinite where no surface of the cell lies in the region. A cell too steep for its plane is bounded by a sphere.
     """
-    if not quad_radius_ok(value, ga, gb, error, half_a, half_b):
-        reach = abs(ga) * half_a + abs(gb) * half_b + error
+    if not quad_radius_ok(value, ga, gb, error, half, half):
+        reach = abs(ga) * half + abs(gb) * half + error
         lo = max(value - reach, 1.0 / blob[ints[leaf + BOX] + 7])
-        x, y, z, radius = cell_sphere(face, a, b, half_a, half_b, value, ga, gb, error, lo, value + reach)
+        x, y, z, radius = cell_sphere(face, a, b, half, half, value, ga, gb, error, lo, value + reach)
         if outside_region(blob, planes, count, x, y, z, radius):
             return np.inf
         distance, _ = distance_to(search, x, y, z)
         x, y, z = direction_of(face, a, b)
         offer_patch_point(blob, ints, leaf, planes, count, search, face, x, y, z, radius)
         return distance - radius
-    thick = model_thickness(face, a, b, half_a, half_b, value, ga, gb, error)
-    c = value - ga * a - gb * b
-    if face % 2 == 1:
-        c = -c
-    if face < 2:
-        gx, gy, gz = c, ga, gb
-    elif face < 4:
-        gx, gy, gz = gb, c, ga
-    else:
-        gx, gy, gz = ga, gb, c
+    thick = model_thickness(face, a, b, half, half, value, ga, gb, error)
+    gx, gy, gz = plane_of(face, a, b, value, ga, gb)
+    along = 0.0
     if search[LENGTH2] == 0.0:
-        # A point: its distance to the whole plane is often bound enough, and where its foot lies in the quad, exact.
-        gg = gx * gx + gy * gy + gz * gz
-        h = gx * search[START] + gy * search[START + 1] + gz * search[START + 2] - 1.0
-        low = abs(h) / math.sqrt(gg) - thick
-        if low > search[BEST] - search[TOLERANCE]:
-            return low
-    for corner in range(4):
-        da = half_a if corner == 1 or corner == 2 else -half_a
-        db = half_b if corner >= 2 else -half_b
-        x, y, z = direction_of(face, a + da, b + db)
-        m = 1.0 / (value + ga * da + gb * db)
-        corners[corner, 0], corners[corner, 1], corners[corner, 2] = x * m, y * m, z * m
+        # A point: its distance to the whole plane is often bound enough.
+        along = abs(gx * search[START] + gy * search[START + 1] + gz * search[START + 2] - 1.0) / math.sqrt(
+            gx * gx + gy * gy + gz * gz
+        )
+        limit = search[BEST] - search[TOLERANCE]
+        if along - thick > limit:
+            return along - thick
+        # And within it: no point of the quad is farther from its middle than this, nor the surface by more than `slant`.
+        slant = ray_thickness(face, a, b, half, half, value, ga, gb, error)
+        x, y, z = direction_of(face, a, b)
+        rx, ry, rz = search[START] - x / value, search[START + 1] - y / value, search[START + 2] - z / value
+        aside = math.sqrt(max(rx * rx + ry * ry + rz * rz - along * along, 0.0))
+        aside -= quad_radius(face, a, b, half, value, ga, gb) + slant
+        if aside > 0.0:
+            low = max(along - thick, 0.0)
+            low = math.sqrt(low * low + aside * aside)
+            if low > limit:
+                return low
+    slant = ray_thickness(face, a, b, half, half, value, ga, gb, error)
+    cell_corners(face, a, b, half, value, ga, gb, corners)
     size = 4
     for k in range(count):
         o = planes + 4 * k
-        size = clip_polygon(corners, size, spare, blob[o], blob[o + 1], blob[o + 2], blob[o + 3] + thick)
+        size = clip_polygon(corners, size, spare, blob[o], blob[o + 1], blob[o + 2], blob[o + 3] + slant)
         if size == 0:
             return np.inf
     distance, _, x, y, z = polygon_to_segment(
@@ -154,34 +160,62 @@ def cell_bound(
         search[VECTOR + 1],
         search[VECTOR + 2],
     )
-    low = distance - thick
+    if search[LENGTH2] == 0.0:
+        # Across the plane the surface strays by `thick`, within it by no more than `slant`.
+        aside = math.sqrt(max(distance * distance - along * along, 0.0)) - slant
+        low = max(along - thick, 0.0)
+        if aside > 0.0:
+            low = math.sqrt(low * low + aside * aside)
+    else:
+        low = distance - slant
     if low < search[BEST] - search[TOLERANCE]:
-        offer_patch_point(blob, ints, leaf, planes, count, search, face, x, y, z, 2.0 * thick)
+        offer_patch_point(blob, ints, leaf, planes, count, search, face, x, y, z, 2.0 * slant)
     return low
 
 
 @njit(cache=True, error_model="numpy")
-def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, corners, spare, rects):
-    """Part a cell of the finest level until what is left of it can hold no nearer point."""
-    depth = 0
+def refine_cell(
+    blob, ints, leaf, planes, count, search, face, a, b, half, bend_lo, bend_hi, corners, spare, rects
+):
+    """Part a cell until what is left of it can hold no nearer point. rects: (NODE_ROOM, 6) scratch.
+
+    Parts are bounded from their exact jet and the bend of what they are a part of, which is proven anew two halvings on;
+    by proven models alone where there are no jets.
+    """
+    jets = has_jets(ints, leaf)
     rects[0, 0], rects[0, 1], rects[0, 2], rects[0, 3] = a, b, half, -1.0
+    rects[0, 4], rects[0, 5] = bend_lo, bend_hi
     depth = 1
+    first = True
     while depth > 0:
         depth -= 1
         a, b, half, low = rects[depth, 0], rects[depth, 1], rects[depth, 2], rects[depth, 3]
+        bend_lo, bend_hi = rects[depth, 4], rects[depth, 5]
         if low > search[BEST] - search[TOLERANCE]:
             continue
+        if not first and jets:
+            _, _, _, _, _, _, _, _, lo, hi = cell_model(blob, ints, leaf, face, a, b, half, half)
+            bend_lo, bend_hi = max(bend_lo, lo), min(bend_hi, hi)
+        first = False
         half *= 0.5
         base = depth
         for corner in range(4):
             ca, cb = a + (half if corner & 1 else -half), b + (half if corner & 2 else -half)
-            value, ga, gb, error, _, _, lo, _ = cell_model(blob, ints, leaf, face, ca, cb, half, half)
+            w = 0.0
+            if jets and bend_hi < math.inf:
+                w, ga, gb = inverse_radius_jet(blob, ints, leaf, face, ca, cb)
+                if w > 0.0:
+                    # Over the part W − tangent lies in half² [min(bend_lo, 0), max(bend_hi, 0)].
+                    up, down = half * half * max(bend_hi, 0.0), half * half * min(bend_lo, 0.0)
+                    value, error = w + 0.5 * (up + down), 0.5 * (up - down) + 1e-12 * w
+            if w == 0.0:
+                value, ga, gb, error, _, _, _, _, _, _ = cell_model(blob, ints, leaf, face, ca, cb, half, half)
             low = cell_bound(
-                blob, ints, leaf, planes, count, search, face, ca, cb, half, half, value, ga, gb, error, corners, spare
+                blob, ints, leaf, planes, count, search, face, ca, cb, half, value, ga, gb, error, corners, spare
             )
             if low > search[BEST] - search[TOLERANCE]:
                 continue
-            if half / lo < FINEST:
+            if half / value < FINEST:
                 x, y, z = direction_of(face, ca, cb)
                 if not outside_region(blob, planes, count, x / value, y / value, z / value, FINEST):
                     distance, t = distance_to(search, x / value, y / value, z / value)
@@ -190,80 +224,200 @@ def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, corne
             # Insert so that the nearest is parted first.
             k = depth
             while k > base and rects[k - 1, 3] < low:
-                for q in range(4):
+                for q in range(6):
                     rects[k, q] = rects[k - 1, q]
                 k -= 1
             rects[k, 0], rects[k, 1], rects[k, 2], rects[k, 3] = ca, cb, half, low
+            rects[k, 4], rects[k, 5] = bend_lo, bend_hi
             depth += 1
 
 
 @njit(cache=True, error_model="numpy")
-def nearest_on_leaf(blob, ints, tab, leaf, planes, count, search, nodes, keys, corners, spare, rects):
-    """Improve the search by the surface of a model leaf within its region. nodes: scratch; keys: their bounds."""
-    n = ints[leaf + CELLS]
-    spheres = ints[leaf + SPHERE_TABLE]
-    depth = 0
-    for face in range(6):
-        o = spheres + 4 * (level_start(n, 1) + face)
-        distance, _ = distance_to(search, tab[o], tab[o + 1], tab[o + 2])
-        low = distance - tab[o + 3]
-        k = depth
-        while k > 0 and keys[k - 1] < low:
-            keys[k], nodes[k] = keys[k - 1], nodes[k - 1]
-            k -= 1
-        keys[k], nodes[k] = low, ((0 * 8 + face) * 1024 + 0) * 1024
-        depth += 1
+def _settle(blob, ints, tab, leaf, planes, count, search, face, o, a, b, half, corners, spare, rects):
+    """Settle a cell for good: by an exact jet near the foot of a point if that proves it, else by parting it."""
+    bend_lo, bend_hi = np.float64(tab[o + BEND_LO]), np.float64(tab[o + BEND_HI])
+    if search[LENGTH2] == 0.0 and bend_hi < math.inf:
+        px, py, pz = search[START], search[START + 1], search[START + 2]
+        ca, cb = a, b
+        value, ga, gb = np.float64(tab[o + VALUE]), np.float64(tab[o + SLOPE_A]), np.float64(tab[o + SLOPE_B])
+        for _ in range(2):
+            na, nb, m = step_to_foot(px, py, pz, face, ca, cb, value, ga, gb)
+            if not m > 0.0:
+                break
+            ca, cb = min(max(na, a - half), a + half), min(max(nb, b - half), b + half)
+            value, ga, gb = inverse_radius_jet(blob, ints, leaf, face, ca, cb)
+            if value == 0.0:
+                break
+            x, y, z = direction_of(face, ca, cb)
+            x, y, z = x / value, y / value, z / value
+            if not outside_region(blob, planes, count, x, y, z, 1e-9):
+                distance, t = distance_to(search, x, y, z)
+                offer(search, distance, t, x, y, z)
+            way = half + max(abs(ca - a), abs(cb - b))
+            radius = search[BEST] - search[TOLERANCE]
+            if radius <= 0.0 or ball_is_free(
+                px, py, pz, radius, face, ca, cb, way, value, ga, gb, bend_lo, bend_hi
+            ):
+                return
+    refine_cell(
+        blob, ints, leaf, planes, count, search, face, a, b, half, bend_lo, bend_hi, corners, spare, rects
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def node_bound(tab, o, search):
+    """Return a lower bound of the segment's distance to a node's disc."""
+    nx, ny, nz = np.float64(tab[o + 3]), np.float64(tab[o + 4]), np.float64(tab[o + 5])
+    thick, radius = np.float64(tab[o + THICK]), np.float64(tab[o + RADIUS])
+    rx, ry, rz = search[START] - tab[o], search[START + 1] - tab[o + 1], search[START + 2] - tab[o + 2]
+    h = rx * nx + ry * ny + rz * nz
+    if search[LENGTH2] == 0.0:
+        aside = math.sqrt(max(rx * rx + ry * ry + rz * rz - h * h, 0.0)) - radius
+        along = max(abs(h) - thick, 0.0)
+        return math.sqrt(along * along + aside * aside) if aside > 0.0 else along
+    # A segment: by the slab about the disc's plane, and by the ball about the disc.
+    dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
+    g = h + dx * nx + dy * ny + dz * nz
+    slab = min(abs(h), abs(g)) - thick if (h > 0.0) == (g > 0.0) else 0.0
+    t = min(max(-(rx * dx + ry * dy + rz * dz) / search[LENGTH2], 0.0), 1.0)
+    rx, ry, rz = rx + t * dx, ry + t * dy, rz + t * dz
+    return max(slab, math.sqrt(rx * rx + ry * ry + rz * rz) - math.sqrt(radius * radius + thick * thick))
+
+
+@njit(cache=True, error_model="numpy")
+def _facet(blob, ints, tab, code, refine, search, local, corners, spare, rects):
+    """Return a lower bound of the distance to a facet, having offered a point of it; if `refine`, settle it."""
+    owner = ints[OWNER_INTS] + OWNER_INT_SIZE * (code >> 24)
+    leaf, planes = ints[owner + OWNER_RECORD], ints[owner + OWNER_PLANE_FLOATS]
+    count = 0 if code & 1 else ints[owner + OWNER_PLANES]
+    frame = ints[leaf + FRAME]
+    qx, qy, qz = into_leaf(blob, ints, leaf, search[START], search[START + 1], search[START + 2])
+    local[START], local[START + 1], local[START + 2] = qx, qy, qz
+    if search[LENGTH2] > 0.0:
+        dx, dy, dz = turn_into_leaf(blob, frame, search[VECTOR], search[VECTOR + 1], search[VECTOR + 2])
+        local[VECTOR], local[VECTOR + 1], local[VECTOR + 2] = dx, dy, dz
+    local[BEST] = search[BEST]
+    o, face, a, b, half = facet_cell(ints, leaf, code)
+    low = -1.0
+    if refine:
+        _settle(blob, ints, tab, leaf, planes, count, local, face, o, a, b, half, corners, spare, rects)
+    else:
+        low = cell_bound(
+            blob, ints, leaf, planes, count, local, face, a, b, half, np.float64(tab[o + VALUE]),
+            np.float64(tab[o + SLOPE_A]), np.float64(tab[o + SLOPE_B]), np.float64(tab[o + ERROR]), corners, spare,
+        )  # fmt: skip
+    if local[BEST] < search[BEST]:
+        x, y, z = turn_out_of_leaf(blob, frame, local[FOOT], local[FOOT + 1], local[FOOT + 2])
+        offer(search, local[BEST], local[BEST_T], x + blob[frame], y + blob[frame + 1], z + blob[frame + 2])
+    return low
+
+
+@njit(cache=True, error_model="numpy")
+def _first_guess(blob, ints, tab, search, local, corners, spare, rects):
+    """Offer a point of the facets under the nearest node at each level, and Newton's steps from there: an early bound."""
+    levels, codes = ints[FACET_LEVELS], ints[FACET_CODES]
+    i = 0
+    for level in range(ints[levels] - 1, -1, -1):
+        start, size = ints[levels + 1 + 2 * level], ints[levels + 2 + 2 * level]
+        nearest, at = np.inf, i
+        for q in range(FAN * i, min(FAN * i + FAN, size)):
+            o = start + DISC_SIZE * q
+            distance, _ = distance_to(search, np.float64(tab[o]), np.float64(tab[o + 1]), np.float64(tab[o + 2]))
+            if distance < nearest:
+                nearest, at = distance, q
+        i = at
+    chosen = -1
+    for q in range(FAN * i, FAN * i + FAN):
+        code = ints[codes + q]
+        if code >= 0:
+            before = search[BEST]
+            _facet(blob, ints, tab, code, False, search, local, corners, spare, rects)
+            if search[BEST] < before:
+                chosen = code
+    if chosen < 0 or search[LENGTH2] > 0.0:
+        return
+    owner = ints[OWNER_INTS] + OWNER_INT_SIZE * (chosen >> 24)
+    leaf = ints[owner + OWNER_RECORD]
+    if not has_jets(ints, leaf):
+        return
+    frame = ints[leaf + FRAME]
+    px, py, pz = into_leaf(blob, ints, leaf, search[START], search[START + 1], search[START + 2])
+    x, y, z = into_leaf(blob, ints, leaf, search[FOOT], search[FOOT + 1], search[FOOT + 2])
+    face, a, b, _ = face_of(x, y, z)
+    for _ in range(3):
+        w, ga, gb = inverse_radius_jet(blob, ints, leaf, face, a, b)
+        if w == 0.0:
+            return
+        a, b, m = step_to_foot(px, py, pz, face, a, b, w, ga, gb)
+        if not (m > 0.0 and abs(a) <= 1.0 and abs(b) <= 1.0):
+            return
+        w = inverse_radius(blob, ints, leaf, face, a, b)
+        x, y, z = direction_of(face, a, b)
+        x, y, z = x / w, y / w, z / w
+        distance = math.sqrt((px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2)
+        if not distance < search[BEST] - 0.1 * search[TOLERANCE] or outside_region(
+            blob, ints[owner + OWNER_PLANE_FLOATS], ints[owner + OWNER_PLANES], x, y, z, 1e-9
+        ):
+            return
+        x, y, z = turn_out_of_leaf(blob, frame, x, y, z)
+        offer(search, distance, 0.0, x + blob[frame], y + blob[frame + 1], z + blob[frame + 2])
+
+
+@njit(cache=True, error_model="numpy")
+def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spare, rects):
+    """Improve the search (tree's frame) by the surface of all model leaves, each within its region.
+
+    nodes, keys: (LATE + NODE_ROOM,) scratch: pending nodes and their bounds, and from LATE on the facets yet to be settled.
+    """
+    if ints[FACET_COUNT] == 0:
+        return
+    levels, codes = ints[FACET_LEVELS], ints[FACET_CODES]
+    level = ints[levels]
+    local[VECTOR], local[VECTOR + 1], local[VECTOR + 2] = 0.0, 0.0, 0.0
+    local[LENGTH2], local[TOLERANCE] = search[LENGTH2], search[TOLERANCE]
+    _first_guess(blob, ints, tab, search, local, corners, spare, rects)
+    depth, waiting = 1, 0
+    nodes[0], keys[0] = level << 40, 0.0  # the node above the highest level
     while depth > 0:
         depth -= 1
         if keys[depth] > search[BEST] - search[TOLERANCE]:
             continue
-        code = nodes[depth]
-        j, i, face, level = code % 1024, (code // 1024) % 1024, (code // 1048576) % 8, code // 8388608
-        side = 2 << level
+        level, i = nodes[depth] >> 40, nodes[depth] & 0xFFFFFFFFFF
+        if level == 0:
+            for q in range(FAN * i, min(FAN * i + FAN, ints[FACET_COUNT])):
+                code = ints[codes + q]
+                if code < 0:
+                    continue
+                low = _facet(blob, ints, tab, code, False, search, local, corners, spare, rects)
+                if low <= search[BEST] - search[TOLERANCE]:
+                    if waiting == NODE_ROOM:  # the late ones begin where the nodes may reach
+                        _facet(blob, ints, tab, code, True, search, local, corners, spare, rects)
+                        continue
+                    # Sorted, the nearest last: they are settled when the search is over, against a tight bound.
+                    waiting += 1
+                    k = LATE + waiting - 1
+                    while k > LATE and keys[k - 1] < low:
+                        keys[k], nodes[k] = keys[k - 1], nodes[k - 1]
+                        k -= 1
+                    keys[k], nodes[k] = low, code
+            continue
+        level -= 1
+        start, size = ints[levels + 1 + 2 * level], ints[levels + 2 + 2 * level]
         base = depth
-        start = 0 if side == n else spheres + 4 * (level_start(n, side) + face * side * side)
-        for corner in range(4):
-            ci, cj = 2 * i + (corner & 1), 2 * j + (corner >> 1)
-            if side < n:
-                o = start + 4 * (ci * side + cj)
-                x, y, z, radius = tab[o], tab[o + 1], tab[o + 2], tab[o + 3]
-                distance, _ = distance_to(search, x, y, z)
-                low = distance - radius
-                if low > search[BEST] - search[TOLERANCE] or outside_region(blob, planes, count, x, y, z, radius):
-                    continue
-            else:
-                o = ints[leaf + CELL_TABLE] + CELL_SIZE * ((face * n + ci) * n + cj)
-                a, b, half = (2 * ci + 1) / n - 1.0, (2 * cj + 1) / n - 1.0, 1.0 / n
-                m = 1.0 / tab[o + VALUE]
-                x, y, z = direction_of(face, a, b)
-                x, y, z, radius = x * m, y * m, z * m, tab[o + RADIUS]
-                distance, _ = distance_to(search, x, y, z)
-                if distance - radius > search[BEST] - search[TOLERANCE]:
-                    continue
-                if outside_region(blob, planes, count, x, y, z, radius):
-                    continue
-                low = cell_bound(
-                    blob, ints, leaf, planes, count, search, face, a, b, half, half,
-                    tab[o + VALUE], tab[o + SLOPE_A], tab[o + SLOPE_B], tab[o + ERROR], corners, spare,
-                )  # fmt: skip
-                if low > search[BEST] - search[TOLERANCE]:
-                    continue
+        for q in range(FAN * i, min(FAN * i + FAN, size)):
+            low = node_bound(tab, start + DISC_SIZE * q, search)
+            if low > search[BEST] - search[TOLERANCE]:
+                continue
             k = depth
             while k > base and keys[k - 1] < low:
                 keys[k], nodes[k] = keys[k - 1], nodes[k - 1]
                 k -= 1
-            keys[k], nodes[k] = low, (((level + 1) * 8 + face) * 1024 + ci) * 1024 + cj
+            keys[k], nodes[k] = low, (level << 40) + q
             depth += 1
-        while depth > base and side == n:  # the finest cells that are left: part them
-            depth -= 1
-            if keys[depth] > search[BEST] - search[TOLERANCE]:
-                continue
-            code = nodes[depth]
-            cj, ci = code % 1024, (code // 1024) % 1024
-            refine_cell(
-                blob, ints, leaf, planes, count, search, face,
-                (2 * ci + 1) / n - 1.0, (2 * cj + 1) / n - 1.0, 1.0 / n, corners, spare, rects,
-            )  # fmt: skip
+    while waiting > 0:
+        waiting -= 1
+        if keys[LATE + waiting] <= search[BEST] - search[TOLERANCE]:
+            _facet(blob, ints, tab, nodes[LATE + waiting], True, search, local, corners, spare, rects)
 
 
 @njit(cache=True, error_model="numpy")

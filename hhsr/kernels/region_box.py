@@ -3,20 +3,20 @@
 import numpy as np
 from numba import njit
 
-from hhsr.kernels.cell import cell_model, direction_of
+from hhsr.kernels.cell import cell_model
 from hhsr.kernels.layout import (
     CELL_SIZE,
     CELL_TABLE,
     CELLS,
     ERROR,
+    PARTING,
     SLOPE_A,
     SLOPE_B,
     VALUE,
     integers,
     tables,
 )
-from hhsr.kernels.maps import cell_sphere, model_thickness, quad_radius_ok
-from hhsr.kernels.nearest import outside_region
+from hhsr.kernels.maps import cell_corners, cell_sphere, outside_region, quad_radius_ok, ray_thickness
 from hhsr.kernels.part import TRIANGLES, part_arrays
 from hhsr.kernels.polygon import ROOM, clip_polygon
 
@@ -35,7 +35,7 @@ def _add_steep(blob, ints, leaf, planes, count, face, a, b, half, rotation, box)
     for i in range(16):
         for j in range(16):
             ca, cb = a - half + (2 * i + 1) * part, b - half + (2 * j + 1) * part
-            value, ga, gb, error, _, _, lo, hi = cell_model(blob, ints, leaf, face, ca, cb, part, part)
+            value, ga, gb, error, _, _, lo, hi, _, _ = cell_model(blob, ints, leaf, face, ca, cb, part, part)
             x, y, z, radius = cell_sphere(face, ca, cb, part, part, value, ga, gb, error, lo, hi)
             if not outside_region(blob, planes, count, x, y, z, radius):
                 _add(box, rotation, x, y, z, radius)
@@ -48,30 +48,28 @@ def leaf_box(blob, leaf, planes, count, rotation, box):
     corners, spare = np.empty((ROOM, 3)), np.empty((ROOM, 3))
     box[:3], box[3:] = np.inf, -np.inf
     n = ints[leaf + CELLS]
-    half = 1.0 / n
-    for face in range(6):
-        for i in range(n):
-            for j in range(n):
-                o = ints[leaf + CELL_TABLE] + CELL_SIZE * ((face * n + i) * n + j)
-                a, b = (2 * i + 1) / n - 1.0, (2 * j + 1) / n - 1.0
-                value, ga, gb, error = tab[o + VALUE], tab[o + SLOPE_A], tab[o + SLOPE_B], tab[o + ERROR]
-                if quad_radius_ok(value, ga, gb, error, half, half):
-                    thick = model_thickness(face, a, b, half, half, value, ga, gb, error)
-                else:  # a steep cell: by spheres about its parts
-                    _add_steep(blob, ints, leaf, planes, count, face, a, b, half, rotation, box)
-                    continue
-                for corner in range(4):
-                    da = half if corner == 1 or corner == 2 else -half
-                    db = half if corner >= 2 else -half
-                    x, y, z = direction_of(face, a + da, b + db)
-                    m = 1.0 / (value + ga * da + gb * db)
-                    corners[corner, 0], corners[corner, 1], corners[corner, 2] = x * m, y * m, z * m
-                size = 4
-                for k in range(count):
-                    q = planes + 4 * k
-                    size = clip_polygon(corners, size, spare, blob[q], blob[q + 1], blob[q + 2], blob[q + 3] + thick)
-                for k in range(size):
-                    _add(box, rotation, corners[k, 0], corners[k, 1], corners[k, 2], thick)
+    for base in range(6 * n * n):
+        face, i, j = base // (n * n), base // n % n, base % n
+        word = ints[ints[leaf + PARTING] + base]
+        if word & 8 == 0:
+            continue
+        s = 1 << (word & 7)
+        half = 1.0 / (n * s)
+        for cell in range(s * s):
+            o = ints[leaf + CELL_TABLE] + CELL_SIZE * ((word >> 4) + cell)
+            a, b = (2 * (i * s + cell // s) + 1) * half - 1.0, (2 * (j * s + cell % s) + 1) * half - 1.0
+            value, ga, gb, error = tab[o + VALUE], tab[o + SLOPE_A], tab[o + SLOPE_B], tab[o + ERROR]
+            if not quad_radius_ok(value, ga, gb, error, half, half):
+                _add_steep(blob, ints, leaf, planes, count, face, a, b, half, rotation, box)
+                continue
+            thick = ray_thickness(face, a, b, half, half, value, ga, gb, error)
+            cell_corners(face, a, b, half, value, ga, gb, corners)
+            size = 4
+            for k in range(count):
+                q = planes + 4 * k
+                size = clip_polygon(corners, size, spare, blob[q], blob[q + 1], blob[q + 2], blob[q + 3] + thick)
+            for k in range(size):
+                _add(box, rotation, corners[k, 0], corners[k, 1], corners[k, 2], thick)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -12,12 +12,14 @@ import numpy as np
 from numba import njit
 
 from hhsr.kernels.cell import cell_model, chart_of, inverse_radius
+from hhsr.kernels.jet import has_jets, inverse_radius_jet
 from hhsr.kernels.layout import (
+    BEND_HI,
+    BEND_LO,
     BOX,
-    CELL_SIZE,
-    CELL_TABLE,
     CELLS,
     ERROR,
+    PARTING,
     RANGE_TABLE,
     SLOPE_A,
     SLOPE_B,
@@ -25,7 +27,7 @@ from hhsr.kernels.layout import (
     SPREAD_B,
     VALUE,
 )
-from hhsr.kernels.maps import level_start
+from hhsr.kernels.maps import cell_at, level_start
 
 PIECES = 64  # depth of the bisection
 UNDECIDED = 2
@@ -72,11 +74,29 @@ def _index(x, side):
 
 
 @njit(cache=True, error_model="numpy")
-def solve_in_cell(blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, x0, x1, f0, f1, slope, tolerance):
+def _border(a0, b0, a1, b1, side):
+    """Return the share at which a piece meets the middle one of the cell borders within it; −1 if it lies in one cell."""
+    i0, i1 = _index(a0, side), _index(a1, side)
+    if i0 != i1:
+        x = ((2.0 * ((i0 + i1 + 1) // 2) / side - 1.0) - a0) / (a1 - a0)
+        if 1e-9 < x < 1.0 - 1e-9:
+            return x
+    j0, j1 = _index(b0, side), _index(b1, side)
+    if j0 != j1:
+        x = ((2.0 * ((j0 + j1 + 1) // 2) / side - 1.0) - b0) / (b1 - b0)
+        if 1e-9 < x < 1.0 - 1e-9:
+            return x
+    return -1.0
+
+
+@njit(cache=True, error_model="numpy")
+def solve_in_cell(blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, x0, x1, f0, f1, slope, steep, tolerance):
     """Return the share x in [x0, x1] where w = W: Newton on the proven slope, safeguarded by the bracket.
 
-    f0, f1: w − W (exact, or its linear model) at x0 and x1, of opposite sign. slope: least |d(w − W)/dx|, proven.
+    f0, f1: w − W (exact, or its linear model) at x0 and x1, of opposite sign. slope, steep: least and greatest
+    |d(w − W)/dx|, proven: a step by their mean from an exact value leaves no more than their spread can.
     """
+    mean, spread = 0.5 * (slope + steep), 0.5 * (steep - slope)
     lo, hi, f_lo, f_hi = x0, x1, f0, f1
     x = lo + (hi - lo) * f_lo / (f_lo - f_hi)
     for _ in range(60):
@@ -84,6 +104,8 @@ def solve_in_cell(blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, x0, x1, f0, f1
         f = w0 + x * (w1 - w0) - inverse_radius(blob, ints, leaf, face, a0 + x * (a1 - a0), b0 + x * (b1 - b0))
         if abs(f) <= slope * tolerance:
             return x
+        if abs(f) * spread <= tolerance * mean * slope:
+            return min(max(x + (abs(f) if (f > 0.0) == (f_lo > 0.0) else -abs(f)) / mean, lo), hi)
         if (f > 0.0) == (f_lo > 0.0):
             lo, f_lo = x, f
             f_hi = 0.5 * f_hi if _ > 2 else f_hi
@@ -215,7 +237,6 @@ def _face_crossings(
 ):
     """Follow the segment over one face."""
     n = ints[leaf + CELLS]
-    cells = ints[leaf + CELL_TABLE] + CELL_SIZE * face * n * n
     a0, b0, m0 = chart_of(face, px + ta * dx, py + ta * dy, pz + ta * dz)
     a1, b1, m1 = chart_of(face, px + tb * dx, py + tb * dy, pz + tb * dz)
     t0, t1, w0, w1 = ta, tb, 1.0 / m0, 1.0 / m1
@@ -234,38 +255,49 @@ def _face_crossings(
         j0, j1 = _index(b0, side), _index(b1, side)
         if j0 > j1:
             j0, j1 = j1, j0
-        if side < n:
-            lo, hi = _range_of(tab, ints, leaf, face, side, i0, i1, j0, j1)
-            if w_lo > hi:
-                verdict = 1
-            elif w_hi < lo:
-                verdict = 0
-        else:
-            # Few cells: settle one at a time, parting the piece at their borders.
-            if i0 != i1:
-                x = ((2.0 * i1 / n - 1.0) - a0) / (a1 - a0)
-                if 1e-9 < x < 1.0 - 1e-9:
-                    split, i1, j1 = x, -1, -1
-            if i1 >= 0 and j0 != j1:
-                x = ((2.0 * j1 / n - 1.0) - b0) / (b1 - b0)
-                if 1e-9 < x < 1.0 - 1e-9:
-                    split, i1, j1 = x, -1, -1
-            if i1 >= 0:
-                i, j = _index(0.5 * (a0 + a1), n), _index(0.5 * (b0 + b1), n)
-                o = cells + CELL_SIZE * (i * n + j)
-                ca, cb = (2 * i + 1) / n - 1.0, (2 * j + 1) / n - 1.0
+        lo, hi = _range_of(tab, ints, leaf, face, side, i0, i1, j0, j1)
+        if w_lo > hi:
+            verdict = 1
+        elif w_hi < lo:
+            verdict = 0
+        elif side == n:
+            # Few cells: settle one at a time, parting the piece at their borders, the middle one first.
+            split = _border(a0, b0, a1, b1, n)
+            if split < 0.0:
+                a, b = 0.5 * (a0 + a1), 0.5 * (b0 + b1)
+                i, j = _index(a, n), _index(b, n)
+                word = ints[ints[leaf + PARTING] + (face * n + i) * n + j]
+                s = 1 << (word & 7)
+                split = _border(a0, b0, a1, b1, n * s)
+            if split < 0.0:
+                split = 0.5
+                o, ca, cb, _ = cell_at(ints, leaf, face, a, b)
                 verdict, state, count = _settle(
                     blob, ints, leaf, face, t0, a0, b0, w0, t1, a1, b1, w1,
                     ca, cb, tab[o + VALUE], tab[o + SLOPE_A], tab[o + SLOPE_B], tab[o + ERROR], tab[o + SPREAD_A],
                     tab[o + SPREAD_B], False, speed, resolution, tolerance, state, out, count,
                 )  # fmt: skip
+                half_a, half_b = 0.5 * abs(a1 - a0) + 1e-12, 0.5 * abs(b1 - b0) + 1e-12
+                bend_lo, bend_hi = np.float64(tab[o + BEND_LO]), np.float64(tab[o + BEND_HI])
+                if verdict == UNDECIDED and has_jets(ints, leaf) and bend_hi - bend_lo < math.inf:
+                    # The exact jet at the middle, and how far the bend of the cell lets W stray from it on the piece.
+                    value, ga, gb = inverse_radius_jet(blob, ints, leaf, face, a, b)
+                    if value > 0.0:
+                        far2 = half_a * half_a + half_b * half_b
+                        up, down = 0.5 * far2 * max(bend_hi, 0.0), 0.5 * far2 * min(bend_lo, 0.0)
+                        stray = max(bend_hi, -bend_lo) * math.sqrt(far2)
+                        verdict, state, count = _settle(
+                            blob, ints, leaf, face, t0, a0, b0, w0, t1, a1, b1, w1,
+                            a, b, value + 0.5 * (up + down), ga, gb, 0.5 * (up - down) + 1e-12 * value, stray, stray, False,
+                            speed, resolution, tolerance, state, out, count,
+                        )  # fmt: skip
                 if verdict == UNDECIDED:
-                    ca, cb = 0.5 * (a0 + a1), 0.5 * (b0 + b1)
-                    half_a, half_b = 0.5 * abs(a1 - a0) + 1e-12, 0.5 * abs(b1 - b0) + 1e-12
-                    value, ga, gb, error, sa, sb, lo, hi = cell_model(blob, ints, leaf, face, ca, cb, half_a, half_b)
+                    value, ga, gb, error, sa, sb, lo, hi, _, _ = cell_model(
+                        blob, ints, leaf, face, a, b, half_a, half_b
+                    )
                     verdict, state, count = _settle(
                         blob, ints, leaf, face, t0, a0, b0, w0, t1, a1, b1, w1,
-                        ca, cb, value, ga, gb, error, sa, sb, True, speed, resolution, tolerance, state, out, count,
+                        a, b, value, ga, gb, error, sa, sb, True, speed, resolution, tolerance, state, out, count,
                     )  # fmt: skip
         if verdict == UNDECIDED and depth < PIECES:
             a, b, w = a0 + split * (a1 - a0), b0 + split * (b1 - b0), w0 + split * (w1 - w0)
@@ -322,7 +354,8 @@ def _settle(
         state, count = emit(state, g0 >= 0.0, t0, out, count)
         if (g0 >= 0.0) != (g1 >= 0.0):
             x = solve_in_cell(
-                blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, x0, x1, g0, g1, slope, tolerance / max(length, 1e-12)
+                blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, x0, x1, g0, g1, slope, 2.0 * abs(rise) - slope,
+                tolerance / max(length, 1e-12),
             )
             state, count = emit(state, g1 >= 0.0, share_to_t(x, t0, t1, w0, w1), out, count)
         return 3, state, count
@@ -332,7 +365,7 @@ def _settle(
         state, count = emit(state, g0 >= 0.0, t0, out, count)
         if (g0 >= 0.0) != (g1 >= 0.0):
             x = solve_in_cell(
-                blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, 0.0, 1.0, g0, g1, 0.0, tolerance / max(length, 1e-12)
+                blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, 0.0, 1.0, g0, g1, 0.0, math.inf, tolerance / max(length, 1e-12)
             )
             state, count = emit(state, g1 >= 0.0, share_to_t(x, t0, t1, w0, w1), out, count)
         return 3, state, count

@@ -7,9 +7,6 @@ from numba import njit
 
 from hhsr.kernels.cell import face_of, leaf_implicit
 from hhsr.kernels.layout import (
-    CELL_SIZE,
-    CELL_TABLE,
-    CELLS,
     CUT,
     ERROR,
     FRAME,
@@ -31,10 +28,9 @@ from hhsr.kernels.layout import (
     integers,
     tables,
 )
+from hhsr.kernels.maps import cell_at
 from hhsr.kernels.part import part_contains, part_field
 from hhsr.kernels.slab import slab_contains, slab_field
-
-INSIDE, OUTSIDE, INVALID = 1, 0, -1
 
 
 @njit(cache=True, error_model="numpy")
@@ -111,12 +107,8 @@ def leaf_contains(blob, ints, tab, leaf, x, y, z):
     if x == 0.0 and y == 0.0 and z == 0.0:
         return True
     face, a, b, m = face_of(x, y, z)
-    n = ints[leaf + CELLS]
-    half = 0.5 * n
-    i, j = min(int((a + 1.0) * half), n - 1), min(int((b + 1.0) * half), n - 1)
-    o = ints[leaf + CELL_TABLE] + CELL_SIZE * ((face * n + i) * n + j)
-    da, db = a - ((2 * i + 1) / n - 1.0), b - ((2 * j + 1) / n - 1.0)
-    gap = 1.0 / m - (tab[o + VALUE] + tab[o + SLOPE_A] * da + tab[o + SLOPE_B] * db)
+    o, ca, cb, _ = cell_at(ints, leaf, face, a, b)
+    gap = 1.0 / m - (tab[o + VALUE] + tab[o + SLOPE_A] * (a - ca) + tab[o + SLOPE_B] * (b - cb))
     if gap > tab[o + ERROR]:
         return True
     if gap < -tab[o + ERROR]:
@@ -141,33 +133,6 @@ def owner_contains(blob, ints, tab, owner, x, y, z):
 def contains_point(blob, ints, tab, root, x, y, z):
     """Return whether the solid of node `root` holds a point of the tree's frame; on the surface is inside."""
     return owner_contains(blob, ints, tab, owner_of(blob, ints, root, x, y, z), x, y, z)
-
-
-@njit(cache=True, error_model="numpy")
-def contains_one(blob, point):
-    """Return 1 inside, 0 outside, −1 not finite, for an LPS point (3,)."""
-    ints, tab = integers(blob), tables(blob)
-    if not (math.isfinite(point[0]) and math.isfinite(point[1]) and math.isfinite(point[2])):
-        return INVALID
-    x, y, z = into_tree(blob, ints, point[0], point[1], point[2])
-    return INSIDE if contains_point(blob, ints, tab, 0, x, y, z) else OUTSIDE
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def contains_many(blob, points, out):
-    """Fill (n,) int8 with 1 inside, 0 outside, −1 not finite; return how many are not finite."""
-    ints, tab = integers(blob), tables(blob)
-    bad = 0
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        if not math.isfinite(x + y + z):
-            if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
-                out[i] = INVALID
-                bad += 1
-                continue
-        x, y, z = into_tree(blob, ints, x, y, z)
-        out[i] = INSIDE if contains_point(blob, ints, tab, 0, x, y, z) else OUTSIDE
-    return bad
 
 
 @njit(cache=True, error_model="numpy")

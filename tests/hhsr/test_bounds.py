@@ -10,6 +10,7 @@ from hhsr.evaluate import leaf_radius
 from hhsr.kernels import layout as at
 from hhsr.kernels.cell import cell_model, direction_of, face_of
 from hhsr.kernels.layout import integers, tables
+from hhsr.kernels.maps import cell_at
 from hhsr.model import CentreGrid, ModelLeaf, ScaleField, Superquadric, Tree, frozen
 from tests.strategies import random_leaf
 
@@ -42,33 +43,30 @@ def test_every_cell_of_the_map_holds_what_it_promises(leaf: ModelLeaf) -> None:
     blob = compile_tree(Tree(leaf, frozen(np.zeros(6)))).blob
     ints, tab = integers(blob), tables(blob)
     record = ints[ints[at.OWNER_INTS] + at.OWNER_RECORD]
-    n = int(ints[record + at.CELLS])
-    start = ints[record + at.CELL_TABLE]
-    models = tab[start : start + 6 * n * n * at.CELL_SIZE].reshape(6, n, n, at.CELL_SIZE).astype(np.float64)
     rng = np.random.default_rng(1)
-    count = 40_000
-    face, i, j = rng.integers(6, size=count), rng.integers(n, size=count), rng.integers(n, size=count)
-    u, v = rng.uniform(-1, 1, (2, count))
-    u[:8000], v[4000:12000] = np.sign(u[:8000]), np.sign(v[4000:12000])  # edges and corners of cells, poles, seams
-    a, b = (2 * i + 1 + u) / n - 1, (2 * j + 1 + v) / n - 1
+    count = 20_000
+    face, u, v = rng.integers(6, size=count), *rng.uniform(-1, 1, (2, count))
+    a, b = rng.uniform(-1, 1, (2, count))
+    found = [cell_at(ints, record, f, x, y) for f, x, y in zip(face, a, b, strict=True)]
+    slot = np.array([f[0] for f in found])
+    ca, cb, half = np.array([f[1:] for f in found]).T
+    assert (np.maximum(np.abs(a - ca), np.abs(b - cb)) <= half * (1 + 1e-9)).all()
+    u[:4000], v[2000:6000] = np.sign(u[:4000]), np.sign(v[2000:6000])  # edges and corners of cells, poles, seams
+    a, b = ca + half * u, cb + half * v
     directions = np.array([direction_of(f, x, y) for f, x, y in zip(face, a, b, strict=True)])
     exact = inverse_radii(leaf, directions)
-    cell = models[face, i, j]
-    guess = cell[:, at.VALUE] + cell[:, at.SLOPE_A] * u / n + cell[:, at.SLOPE_B] * v / n
+    cell = tab[slot[:, None] + np.arange(at.CELL_SIZE)].astype(np.float64)
+    guess = cell[:, at.VALUE] + cell[:, at.SLOPE_A] * half * u + cell[:, at.SLOPE_B] * half * v
     assert (np.abs(exact - guess) <= cell[:, at.ERROR]).all()
-    middle = np.array(
-        [direction_of(f, x, y) for f, x, y in zip(face, (2 * i + 1) / n - 1, (2 * j + 1) / n - 1, strict=True)]
-    )
-    gap = np.sqrt(((directions / exact[:, None] - middle / cell[:, :1]) ** 2).sum(axis=1))
-    assert (gap <= cell[:, at.RADIUS]).all()
+    assert (cell[:, at.BEND_LO] <= cell[:, at.BEND_HI]).all()
     # The slopes' spread, by differences along both axes within the cell.
     for axis, slope, spread in ((0, at.SLOPE_A, at.SPREAD_A), (1, at.SLOPE_B, at.SPREAD_B)):
-        step = 1e-4 / n
+        step = 1e-4 * half
         sign = -np.sign(u if axis == 0 else v)
         other = np.array(
             [
-                direction_of(f, x + step * s * (axis == 0), y + step * s * (axis == 1))
-                for f, x, y, s in zip(face, a, b, sign, strict=True)
+                direction_of(f, x + d * (axis == 0), y + d * (axis == 1))
+                for f, x, y, d in zip(face, a, b, step * sign, strict=True)
             ]
         )
         rate = (inverse_radii(leaf, other) - exact) / (step * sign)
@@ -91,7 +89,7 @@ def test_models_of_any_rectangle_hold(half: float) -> None:
                 if half > 0.05
                 else -1 + (block + rng.uniform(0.1, 0.9, 2)) / 4
             )
-            value, ga, gb, error, _, _, low, high = cell_model(blob, ints, record, face, ca, cb, half, half)
+            value, ga, gb, error, _, _, low, high, _, _ = cell_model(blob, ints, record, face, ca, cb, half, half)
             da, db = half * rng.uniform(-1, 1, (2, 30))
             directions = np.array([direction_of(face, ca + x, cb + y) for x, y in zip(da, db, strict=True)])
             exact = inverse_radii(leaf, directions)

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 import pytest
 
-from hhsr.compiled import records
+from hhsr.compiled import leaf_maps, proofs, records
 from hhsr.kernels import norm_bounds
 from hhsr.model import (
     CentreGrid,
@@ -142,12 +142,14 @@ def arithmetic_of_c(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @cache
 def solid(name: str) -> Shape:
-    """Return a shape, compiled once with maps of 16 cells a face side, so that it takes a moment without the compiler.
+    """Return a shape, compiled once with coarse maps and voxels, so that it takes a moment without the compiler.
 
     What is proven holds for maps of any size; coarse ones leave more to the searches.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(records, "MAP_SIZES", ((math.inf, 16),), raising=False)
+        patch.setattr(records, "BASE_SIDE", 8)
+        patch.setattr(leaf_maps, "CELLS_TOTAL", 1200)
+        patch.setattr(proofs, "VOXELS_TOTAL", 600)
         shape = Shape(TREES[name]())
         assert shape.compiled.nbytes > 0
     return shape

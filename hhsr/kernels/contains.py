@@ -1,0 +1,38 @@
+"""Inside or outside, for LPS points: a voxel's byte, else the owner's map, else the exact formula."""
+
+import math
+
+from numba import njit
+
+from hhsr.kernels.layout import integers, tables
+from hhsr.kernels.tree import into_tree
+from hhsr.kernels.voxels import solid_contains
+
+INSIDE, OUTSIDE, INVALID = 1, 0, -1
+
+
+@njit(cache=True, error_model="numpy")
+def contains_one(blob, point):
+    """Return 1 inside, 0 outside, −1 not finite, for an LPS point (3,)."""
+    ints, tab = integers(blob), tables(blob)
+    if not (math.isfinite(point[0]) and math.isfinite(point[1]) and math.isfinite(point[2])):
+        return INVALID
+    x, y, z = into_tree(blob, ints, point[0], point[1], point[2])
+    return INSIDE if solid_contains(blob, ints, tab, 0, x, y, z) else OUTSIDE
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def contains_many(blob, points, out):
+    """Fill (n,) int8 with 1 inside, 0 outside, −1 not finite; return how many are not finite."""
+    ints, tab = integers(blob), tables(blob)
+    bad = 0
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if not math.isfinite(x + y + z):
+            if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
+                out[i] = INVALID
+                bad += 1
+                continue
+        x, y, z = into_tree(blob, ints, x, y, z)
+        out[i] = INSIDE if solid_contains(blob, ints, tab, 0, x, y, z) else OUTSIDE
+    return bad
