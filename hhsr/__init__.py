@@ -6,19 +6,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from hhsr.answers import Crossings
     from hhsr.errors import FileFormatError, FitError, HhsrError, InputError, SurfaceError
     from hhsr.fitting import FitOptions, fit
     from hhsr.read import Surface, read_surface
-    from hhsr.shape import Crossings, Shape, load
+    from hhsr.shape import Shape, load
+    from hhsr.shape_set import ShapeSet
 
 _DOOR = {
-    "Crossings": "shape",
+    "Crossings": "answers",
     "FileFormatError": "errors",
     "FitError": "errors",
     "FitOptions": "fitting",
     "HhsrError": "errors",
     "InputError": "errors",
     "Shape": "shape",
+    "ShapeSet": "shape_set",
     "Surface": "read",
     "SurfaceError": "errors",
     "fit": "fitting",
@@ -34,6 +37,7 @@ __all__ = [
     "HhsrError",
     "InputError",
     "Shape",
+    "ShapeSet",
     "Surface",
     "SurfaceError",
     "fit",

@@ -18,6 +18,8 @@ def as_points(value: ArrayLike, name: str = "points") -> FloatArray:
         points = np.ascontiguousarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: got {type(value).__name__}, expected numbers of shape (..., 3)") from error
+    if not points.flags.writeable:  # kernels would be compiled anew for it: a minute in which nothing answers
+        points = points.copy()
     if points.shape == (0,):
         return points.reshape(0, 3)
     if points.ndim == 0 or points.shape[-1] != 3:

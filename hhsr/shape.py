@@ -6,13 +6,25 @@ import builtins
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from hhsr import io
+from hhsr.answers import (
+    Clearance,
+    Crossings,
+    OnInvalid,
+    Profile,
+    broadcast_segments,
+    crossings_of_one,
+    curve,
+    marks,
+    one_row,
+    scalar,
+)
 from hhsr.batches import in_parts
 from hhsr.check import as_float, as_points, as_rigid, require_finite
 from hhsr.compiled import Compiled, compile_tree
@@ -21,52 +33,15 @@ from hhsr.kernels import contains as contains_kernels
 from hhsr.kernels import crossing as crossing_kernels
 from hhsr.kernels import distance as distance_kernels
 from hhsr.kernels import tree as tree_kernels
-from hhsr.model import ErrorFigures, FloatArray, IntArray, Provenance, Tree, rotation_matrix
+from hhsr.model import ErrorFigures, FloatArray, Provenance, Tree, rotation_matrix
 from hhsr.surface import reconstruct
 
 if TYPE_CHECKING:
     import trimesh
 
-OnInvalid = Literal["raise", "mark"]
-
 RESOLUTION_MM = 0.01
 CROSSING_TOLERANCE_MM = 0.001
 TOLERANCE_MM = 0.01
-
-
-class Crossings(NamedTuple):
-    """Where segments cross a shape's surface; segment i has rows offsets[i] … offsets[i + 1], in order.
-
-    offsets: (n + 1,). t: (m,) share of the segment, in [0, 1]. points: (m, 3) LPS mm. entering: (m,) bool.
-    valid: (n,) bool, False where a segment was not finite (asked with on_invalid="mark").
-    """
-
-    offsets: IntArray
-    t: FloatArray
-    points: FloatArray
-    entering: NDArray[np.bool_]
-    valid: NDArray[np.bool_]
-
-
-class Clearance(NamedTuple):
-    """Clearance of capsules, with the closest pair.
-
-    clearance: (...) mm. t: (...) share of the segment where the axis is nearest (deepest, where it enters).
-    on_axis, on_surface: (..., 3) the pair of points, LPS mm.
-    """
-
-    clearance: FloatArray
-    t: FloatArray
-    on_axis: FloatArray
-    on_surface: FloatArray
-
-
-class Profile(NamedTuple):
-    """What lies along segments. t: (n,) shares. distance: (..., n) signed, mm. inside_mm: (...) length inside."""
-
-    t: FloatArray
-    distance: FloatArray
-    inside_mm: Any
 
 
 class Shape:
@@ -166,10 +141,10 @@ class Shape:
         on_invalid="mark": int8 instead, 1 inside, 0 outside, −1 where a point is not finite (else that is InputError).
         """
         if type(points) is np.ndarray and points.shape == (3,) and points.dtype == np.float64:
-            code = contains_kernels.contains_one(self._blob, points)
+            code = contains_kernels.contains_one(self._blob, *points.tolist())
             if code >= 0 and on_invalid == "raise":
                 return code == 1
-        array, mark = as_points(points), _marks(on_invalid)
+        array, mark = as_points(points), marks(on_invalid)
         flat = array.reshape(-1, 3)
         out = np.empty(len(flat), dtype=np.int8)
         blob = self._blob
@@ -177,7 +152,7 @@ class Shape:
         if bad and not mark:
             require_finite(array, "points")
         result = out.reshape(array.shape[:-1])
-        return _scalar(result if mark else result == 1)
+        return scalar(result if mark else result == 1)
 
     def field(self, points: ArrayLike, on_invalid: OnInvalid = "raise") -> Any:
         """Return (...) the implicit value at points (..., 3): ≤ 0 inside; no distance, and it jumps across step faces.
@@ -185,14 +160,14 @@ class Shape:
         G of Eq. 3 in a leaf's region, (|p∥ − c| − r)/r of the nearest lobe in a slab, signed distance over extent in a
         retained part's.
         """
-        array, mark = as_points(points), _marks(on_invalid)
+        array, mark = as_points(points), marks(on_invalid)
         flat = array.reshape(-1, 3)
         out = np.empty(len(flat))
         blob = self._blob
         bad = sum(in_parts(len(flat), 10_000, lambda i, j: tree_kernels.field_many(blob, flat[i:j], out[i:j])))
         if bad and not mark:
             require_finite(array, "points")
-        return _scalar(out.reshape(array.shape[:-1]))
+        return scalar(out.reshape(array.shape[:-1]))
 
     def signed_distance(
         self, points: ArrayLike, on_invalid: OnInvalid = "raise", tolerance_mm: float = TOLERANCE_MM
@@ -201,6 +176,10 @@ class Shape:
 
         NaN where a point is not finite, with on_invalid="mark"; +inf for an empty solid.
         """
+        if (row := one_row(points)) is not None and on_invalid == "raise":
+            distance, tolerance = np.empty(1), as_float(tolerance_mm, "tolerance_mm", 1e-6, 1e3)
+            if distance_kernels.nearest_many(self._blob, row, tolerance, distance, np.empty((1, 3))) == 0:
+                return distance.item()
         return self._nearest(points, on_invalid, tolerance_mm)[1]
 
     def closest_point(
@@ -210,7 +189,7 @@ class Shape:
         return self._nearest(points, on_invalid, tolerance_mm)
 
     def _nearest(self, points: ArrayLike, on_invalid: OnInvalid, tolerance_mm: float) -> tuple[FloatArray, Any]:
-        array, mark = as_points(points), _marks(on_invalid)
+        array, mark = as_points(points), marks(on_invalid)
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-6, 1e3)
         flat = array.reshape(-1, 3)
         distance, foot = np.empty(len(flat)), np.empty((len(flat), 3))
@@ -224,7 +203,7 @@ class Shape:
         )
         if bad and not mark:
             require_finite(array, "points")
-        return foot.reshape(array.shape), _scalar(distance.reshape(array.shape[:-1]))
+        return foot.reshape(array.shape), scalar(distance.reshape(array.shape[:-1]))
 
     # -- what a segment meets -----------------------------------------------------------------------------------------
 
@@ -241,9 +220,14 @@ class Shape:
         Nothing thicker than the resolution is missed; places are right to the tolerance. Between two outside points the
         number is even. A segment of no length has no crossings.
         """
-        first, last, _ = broadcast_segments(starts, ends)
         resolution = as_float(resolution_mm, "resolution_mm", 1e-6, 1e3)
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-9, 1e3)
+        if (start := one_row(starts)) is not None and (end := one_row(ends)) is not None and on_invalid == "raise":
+            number, inside, t = np.empty(1, dtype=np.int64), np.empty(1, dtype=np.bool_), np.empty(64)
+            done, used = crossing_kernels.cross_many(self._blob, start, end, resolution, tolerance, number, inside, t)
+            if done == 1 and number[0] >= 0:
+                return crossings_of_one(start, end, t[:used], bool(inside[0]))
+        first, last, _ = broadcast_segments(starts, ends)
         counts, begins = np.empty(len(first), dtype=np.int64), np.empty(len(first), dtype=np.bool_)
         blob = self._blob
 
@@ -265,7 +249,7 @@ class Shape:
         t = np.concatenate(in_parts(len(first), 4_000, part)) if len(first) else np.empty(0)
         valid = counts >= 0
         if not valid.all():
-            if not _marks(on_invalid):
+            if not marks(on_invalid):
                 require_finite(first, "starts")
                 require_finite(last, "ends")
             counts = np.where(valid, counts, 0)
@@ -289,7 +273,7 @@ class Shape:
         With on_invalid="mark": (t, valid), valid (...) False where a segment is not finite.
         """
         first, last, shape = broadcast_segments(starts, ends)
-        mark = _marks(on_invalid)
+        mark = marks(on_invalid)
         resolution = as_float(resolution_mm, "resolution_mm", 1e-6, 1e3)
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-9, 1e3)
         out = np.empty(len(first))
@@ -307,8 +291,8 @@ class Shape:
         valid = out != -1.0
         out[~valid] = np.nan
         if mark:
-            return _scalar(out.reshape(shape)), _scalar(valid.reshape(shape))
-        return _scalar(out.reshape(shape))
+            return scalar(out.reshape(shape)), scalar(valid.reshape(shape))
+        return scalar(out.reshape(shape))
 
     def clearance(
         self,
@@ -323,6 +307,15 @@ class Shape:
         min over the segment of signed_distance − radius: −(greatest depth) − radius where the axis enters. Never above
         the truth, at most the tolerance below it. NaN where not finite, with on_invalid="mark".
         """
+        if (start := one_row(starts)) is not None and (end := one_row(ends)) is not None and on_invalid == "raise":
+            thick = as_float(radius, "radius", 0.0)
+            tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-4, 1e3)
+            value = np.empty(1)
+            if (
+                distance_kernels.clearance_many(self._blob, start, end, tolerance, value, np.empty(1), np.empty((1, 3)))
+                == 0
+            ):
+                return value.item() - thick
         return self.closest_approach(starts, ends, radius, on_invalid, tolerance_mm).clearance
 
     def closest_approach(
@@ -335,7 +328,7 @@ class Shape:
     ) -> Clearance:
         """Return `clearance` with the closest pair of points and where along the segment it lies."""
         first, last, shape = broadcast_segments(starts, ends)
-        mark = _marks(on_invalid)
+        mark = marks(on_invalid)
         thick = as_float(radius, "radius", 0.0)
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-4, 1e3)
         value, t, foot = np.empty(len(first)), np.empty(len(first)), np.empty((len(first), 3))
@@ -354,8 +347,8 @@ class Shape:
             require_finite(last, "ends")
         axis = first + t[:, None] * (last - first)
         return Clearance(
-            _scalar((value - thick).reshape(shape)),
-            _scalar(t.reshape(shape)),
+            scalar((value - thick).reshape(shape)),
+            scalar(t.reshape(shape)),
             axis.reshape(*shape, 3),
             foot.reshape(*shape, 3),
         )
@@ -374,19 +367,19 @@ class Shape:
         row = np.repeat(np.arange(len(first)), np.diff(found.offsets))
         share = np.bincount(row, weights=rest, minlength=len(first)) + np.asarray(self.contains(first), dtype=float)
         length = np.sqrt(((last - first) ** 2).sum(axis=1))
-        return Profile(t, distance, _scalar((share * length).reshape(shape)))
+        return Profile(t, distance, scalar((share * length).reshape(shape)))
 
     # -- a curved needle ----------------------------------------------------------------------------------------------
 
     def polyline_crossings(self, points: ArrayLike) -> Crossings:
         """Return the crossings of a curve (k, 3), k ≥ 2: offsets and t of its k − 1 segments, in order along it."""
-        curve = _curve(points)
-        return self.crossings(curve[:-1], curve[1:])
+        rows = curve(points)
+        return self.crossings(rows[:-1], rows[1:])
 
     def polyline_clearance(self, points: ArrayLike, radius: float = 0.0) -> float:
         """Return mm between a curve (k, 3) of a radius and the solid, as `clearance`: the least of its segments."""
-        curve = _curve(points)
-        return float(np.min(self.clearance(curve[:-1], curve[1:], radius)))
+        rows = curve(points)
+        return float(np.min(self.clearance(rows[:-1], rows[1:], radius)))
 
 
 def load(path: str | Path) -> Shape:
@@ -396,38 +389,3 @@ def load(path: str | Path) -> Shape:
     except OSError as error:
         raise FileFormatError(f"{path}: cannot be read ({error.strerror}), expected a .hhsr file") from error
     return Shape(*io.decode(content))
-
-
-def _curve(points: ArrayLike) -> FloatArray:
-    curve = as_points(points)
-    if curve.ndim != 2 or len(curve) < 2:
-        raise InputError(f"points: got shape {curve.shape}, expected (k, 3) with k ≥ 2 points along a curve")
-    return curve
-
-
-def _marks(on_invalid: str) -> bool:
-    if on_invalid not in ("raise", "mark"):
-        raise InputError(f'on_invalid: got {on_invalid!r}, expected "raise" or "mark"')
-    return on_invalid == "mark"
-
-
-def _scalar(array: NDArray[Any]) -> Any:
-    """Return a Python scalar for a 0-d array: one point in, one answer out."""
-    return array.item() if array.ndim == 0 else array
-
-
-def broadcast_segments(starts: ArrayLike, ends: ArrayLike) -> tuple[FloatArray, FloatArray, tuple[int, ...]]:
-    """Return starts and ends as (n, 3), and the shape (...) of the answer; one start may serve many ends."""
-    first, last = as_points(starts, "starts"), as_points(ends, "ends")
-    if first.shape != last.shape:
-        try:
-            first, last = np.broadcast_arrays(first, last)
-        except ValueError as error:
-            raise InputError(
-                f"starts and ends: got shapes {first.shape} and {last.shape}, expected one end for each start"
-            ) from error
-        first, last = np.ascontiguousarray(first), np.ascontiguousarray(last)
-    return first.reshape(-1, 3), last.reshape(-1, 3), first.shape[:-1]
-
-
-__all__ = ["Clearance", "Crossings", "Profile", "Shape", "load"]

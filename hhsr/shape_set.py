@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hhsr.answers import Crossings, broadcast_segments
 from hhsr.check import as_float, as_points, require_finite
 from hhsr.errors import InputError
 from hhsr.model import FloatArray, IntArray
-from hhsr.shape import Crossings, Shape, broadcast_segments
+from hhsr.shape import Shape
 
 
 class Nearest(NamedTuple):

@@ -16,7 +16,6 @@ from hhsr.kernels.layout import (
     NODE_FLOATS,
     NODE_INT_SIZE,
     NODE_INTS,
-    OWNER_BOX,
     OWNER_INT_SIZE,
     OWNER_INTS,
     OWNER_KIND,

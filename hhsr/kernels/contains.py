@@ -12,12 +12,12 @@ INSIDE, OUTSIDE, INVALID = 1, 0, -1
 
 
 @njit(cache=True, error_model="numpy")
-def contains_one(blob, point):
-    """Return 1 inside, 0 outside, −1 not finite, for an LPS point (3,)."""
+def contains_one(blob, x, y, z):
+    """Return 1 inside, 0 outside, −1 not finite, for an LPS point."""
     ints, tab = integers(blob), tables(blob)
-    if not (math.isfinite(point[0]) and math.isfinite(point[1]) and math.isfinite(point[2])):
+    if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
         return INVALID
-    x, y, z = into_tree(blob, ints, point[0], point[1], point[2])
+    x, y, z = into_tree(blob, ints, x, y, z)
     return INSIDE if solid_contains(blob, ints, tab, 0, x, y, z) else OUTSIDE
 
 

@@ -55,7 +55,10 @@ def facet_cell(ints, leaf, code):
     word = ints[ints[leaf + PARTING] + base]
     k = word & 7
     half = 1.0 / (1 << (bits + k))
-    i, j = ((base >> bits & (1 << bits) - 1) << k) + (cell >> k), ((base & (1 << bits) - 1) << k) + (cell & (1 << k) - 1)
+    i, j = (
+        ((base >> bits & (1 << bits) - 1) << k) + (cell >> k),
+        ((base & (1 << bits) - 1) << k) + (cell & (1 << k) - 1),
+    )
     slot = ints[leaf + CELL_TABLE] + CELL_SIZE * ((word >> 4) + cell)
     return slot, base >> 2 * bits, (2 * i + 1) * half - 1.0, (2 * j + 1) * half - 1.0, half
 

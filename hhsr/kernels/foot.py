@@ -126,6 +126,4 @@ def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, foot):
     if not (bend_lo > -np.inf and bend_hi < np.inf):
         return distance, False
     way = max(reach_a + abs(ca - a), reach_b + abs(cb - b))
-    return distance, ball_is_free(
-        px, py, pz, distance - tolerance, face, ca, cb, way, w, ga, gb, bend_lo, bend_hi
-    )
+    return distance, ball_is_free(px, py, pz, distance - tolerance, face, ca, cb, way, w, ga, gb, bend_lo, bend_hi)

@@ -172,9 +172,7 @@ def prove_base(blob, leaf, n, planes, count, models, spans, thickness):
         for i in range(n):
             for j in range(n):
                 a, b = (2 * i + 1) * half - 1.0, (2 * j + 1) * half - 1.0
-                value, ga, gb, error, da, db, lo, hi, b0, b1 = cell_model(
-                    blob, ints, leaf, face, a, b, half, half
-                )
+                value, ga, gb, error, da, db, lo, hi, b0, b1 = cell_model(blob, ints, leaf, face, a, b, half, half)
                 _write(models[face, i, j], value, ga, gb, error, half, da, db, b0, b1)
                 spans[face, i, j, 0], spans[face, i, j, 1] = lo, hi
                 x, y, z, radius = cell_sphere(face, a, b, half, half, value, ga, gb, error, lo, hi)
@@ -223,15 +221,16 @@ def prove_cells(blob, leaf, n, parting, models, spans, cells, bends):
                     for q in range(s):
                         a, b = (2 * (i * s + p) + 1) * half - 1.0, (2 * (j * s + q) + 1) * half - 1.0
                         value, ga, gb, error, da, db, lo, hi, b0, b1 = cell_model(
-                    blob, ints, leaf, face, a, b, half, half
-                )
+                            blob, ints, leaf, face, a, b, half, half
+                        )
                         _write(cells[first + p * s + q], value, ga, gb, error, half, da, db, b0, b1)
                         low, high = min(low, lo), max(high, hi)
                         cell = cells[first + p * s + q]
                         bends[face, i, j, 0] = min(bends[face, i, j, 0], cell[BEND_LO])
                         bends[face, i, j, 1] = max(bends[face, i, j, 1], cell[BEND_HI])
-                spans[face, i, j, 0], spans[face, i, j, 1] = max(spans[face, i, j, 0], low), min(
-                    spans[face, i, j, 1], high
+                spans[face, i, j, 0], spans[face, i, j, 1] = (
+                    max(spans[face, i, j, 0], low),
+                    min(spans[face, i, j, 1], high),
                 )
 
 

@@ -174,9 +174,7 @@ def cell_bound(blob, ints, leaf, planes, count, search, face, a, b, half, value,
 
 
 @njit(cache=True, error_model="numpy")
-def refine_cell(
-    blob, ints, leaf, planes, count, search, face, a, b, half, bend_lo, bend_hi, corners, spare, rects
-):
+def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, bend_lo, bend_hi, corners, spare, rects):
     """Part a cell until what is left of it can hold no nearer point. rects: (NODE_ROOM, 6) scratch.
 
     Parts are bounded from their exact jet and the bend of what they are a part of, which is proven anew two halvings on;
@@ -255,13 +253,9 @@ def _settle(blob, ints, tab, leaf, planes, count, search, face, o, a, b, half, c
                 offer(search, distance, t, x, y, z)
             way = half + max(abs(ca - a), abs(cb - b))
             radius = search[BEST] - search[TOLERANCE]
-            if radius <= 0.0 or ball_is_free(
-                px, py, pz, radius, face, ca, cb, way, value, ga, gb, bend_lo, bend_hi
-            ):
+            if radius <= 0.0 or ball_is_free(px, py, pz, radius, face, ca, cb, way, value, ga, gb, bend_lo, bend_hi):
                 return
-    refine_cell(
-        blob, ints, leaf, planes, count, search, face, a, b, half, bend_lo, bend_hi, corners, spare, rects
-    )
+    refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, bend_lo, bend_hi, corners, spare, rects)
 
 
 @njit(cache=True, error_model="numpy")

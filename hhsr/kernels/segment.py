@@ -354,7 +354,22 @@ def _settle(
         state, count = emit(state, g0 >= 0.0, t0, out, count)
         if (g0 >= 0.0) != (g1 >= 0.0):
             x = solve_in_cell(
-                blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, x0, x1, g0, g1, slope, 2.0 * abs(rise) - slope,
+                blob,
+                ints,
+                leaf,
+                face,
+                a0,
+                b0,
+                w0,
+                a1,
+                b1,
+                w1,
+                x0,
+                x1,
+                g0,
+                g1,
+                slope,
+                2.0 * abs(rise) - slope,
                 tolerance / max(length, 1e-12),
             )
             state, count = emit(state, g1 >= 0.0, share_to_t(x, t0, t1, w0, w1), out, count)
@@ -365,7 +380,23 @@ def _settle(
         state, count = emit(state, g0 >= 0.0, t0, out, count)
         if (g0 >= 0.0) != (g1 >= 0.0):
             x = solve_in_cell(
-                blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, 0.0, 1.0, g0, g1, 0.0, math.inf, tolerance / max(length, 1e-12)
+                blob,
+                ints,
+                leaf,
+                face,
+                a0,
+                b0,
+                w0,
+                a1,
+                b1,
+                w1,
+                0.0,
+                1.0,
+                g0,
+                g1,
+                0.0,
+                math.inf,
+                tolerance / max(length, 1e-12),
             )
             state, count = emit(state, g1 >= 0.0, share_to_t(x, t0, t1, w0, w1), out, count)
         return 3, state, count

@@ -26,7 +26,6 @@ from hhsr.kernels.layout import (
     SLOPE_B,
     VALUE,
     integers,
-    tables,
 )
 from hhsr.kernels.maps import cell_at
 from hhsr.kernels.part import part_contains, part_field

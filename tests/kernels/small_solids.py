@@ -147,8 +147,8 @@ def solid(name: str) -> Shape:
     What is proven holds for maps of any size; coarse ones leave more to the searches.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(records, "BASE_SIDE", 8)
-        patch.setattr(leaf_maps, "CELLS_TOTAL", 1200)
+        patch.setattr(records, "BASE_SIDE", 16)
+        patch.setattr(leaf_maps, "CELLS_TOTAL", 3000)
         patch.setattr(proofs, "VOXELS_TOTAL", 600)
         shape = Shape(TREES[name]())
         assert shape.compiled.nbytes > 0
