@@ -73,7 +73,7 @@ class Proofs(Records):
         """Return how many cells the map of a leaf has."""
         ints = blob.view(np.int64)
         last = int(ints[ints[owner.record + at.PARTING] + 6 * ints[owner.record + at.CELLS] ** 2 - 1])
-        return (last >> 4) + 4 ** (last & 7)
+        return int((last >> 4) + 4 ** (last & 7))
 
     def fill_bands(self, blob: FloatArray, blob_view: FloatArray) -> BandTables:
         """Fill L and R of every lobe, the deepest cuts first: a child's section already has its own bands."""

@@ -43,7 +43,7 @@ def _index(x, side):
 
 @njit(cache=True, error_model="numpy")
 def _over_cells(ints, tab, leaf, face, q, e, m_hi, a_lo, a_hi, b_lo, b_hi):
-    """Return the state of a box over the cells of a face that hold a rectangle of directions, each by its linear model."""
+    """Return the state of a box over a rectangle of directions of a face, each cell by its linear model."""
     n = ints[leaf + CELLS]
     state = -1
     for i in range(_index(a_lo, n), _index(a_hi, n) + 1):
@@ -149,7 +149,7 @@ def _part_box_state(blob, ints, part, q, e, stack):
 
 @njit(cache=True, error_model="numpy")
 def box_state(blob, ints, tab, x, y, z, half, nodes, stack, q, e):
-    """Return IN, OUT or MIXED of the cube about (x, y, z), tree frame. nodes, stack: integer scratch; q, e: (3,) scratch."""
+    """Return IN, OUT or MIXED of the cube about (x, y, z), tree frame; nodes, stack, q, e: scratch."""
     half += SLACK + 1e-9 * (abs(x) + abs(y) + abs(z))
     state = -1
     nodes[0] = 0

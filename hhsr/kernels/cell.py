@@ -239,8 +239,10 @@ def _third(n_lo, n_hi, n1, n2, d, s1, s2, s3):
 def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
     """Return (value, slope_a, slope_b, error, spread_a, spread_b, lo, hi, bend_lo, bend_hi) of W over a rectangle.
 
-    |W − value − slope·δ| ≤ error, |∂W − slope| ≤ spread, lo ≤ W ≤ hi, and the eigenvalues of ∂²W lie in [bend_lo, bend_hi]
-    (infinite where the base is no ellipsoid or the field may be capped): all proven on the whole rectangle about (a, b).
+    |W − value − slope·δ| ≤ error, |∂W − slope| ≤ spread, lo ≤ W ≤ hi, and the eigenvalues of ∂²W lie in [bend_lo,
+    bend_hi]
+    (infinite where the base is no ellipsoid or the field may be capped): all proven on the whole rectangle about (a,
+    b).
     `value` is the middle of that strip, not W at the centre. The rectangle must lie within one block of directions and
     straddle no coordinate plane.
     """

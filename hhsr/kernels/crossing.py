@@ -98,8 +98,8 @@ def owner_crossings(
 
 @njit(cache=True, error_model="numpy")
 def _follow_tree(
-    blob, ints, tab, root, px, py, pz, dx, dy, dz, begin, end, gap, resolution, tolerance, first, state, out, count, work,
-    slots, pending,
+    blob, ints, tab, root, px, py, pz, dx, dy, dz, begin, end, gap, resolution, tolerance, first, state, out, count,
+    work, slots, pending,
 ):  # fmt: skip
     """Follow p + t·d for t in [begin, end] by clipping down the tree; return (state, count, done)."""
     pending[0], slots[0, 0], slots[0, 1] = root, begin, end
@@ -168,8 +168,8 @@ def follow_segment(
     done = False
     if root != 0 or ints[VOXELS] == 0:
         state, count, done = _follow_tree(
-            blob, ints, tab, root, px, py, pz, dx, dy, dz, 0.0, 1.0, gap, resolution, tolerance, first, state, out, count,
-            work, slots, pending,
+            blob, ints, tab, root, px, py, pz, dx, dy, dz, 0.0, 1.0, gap, resolution, tolerance, first, state, out,
+            count, work, slots, pending,
         )  # fmt: skip
     else:
         nudge = max(NUDGE / length, 1e-15)
@@ -191,8 +191,8 @@ def follow_segment(
             t = max(end, t) + nudge
         if since >= 0.0 and not done:
             state, count, done = _follow_tree(
-                blob, ints, tab, root, px, py, pz, dx, dy, dz, since, 1.0, gap, resolution, tolerance, first, state, out,
-                count, work, slots, pending,
+                blob, ints, tab, root, px, py, pz, dx, dy, dz, since, 1.0, gap, resolution, tolerance, first, state,
+                out, count, work, slots, pending,
             )  # fmt: skip
     if done:
         return begin, count

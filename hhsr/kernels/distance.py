@@ -29,7 +29,10 @@ from hhsr.kernels.layout import (
     integers,
     tables,
 )
-from hhsr.kernels.nearest import (
+from hhsr.kernels.nearest import nearest_on_leaves, owner_planes
+from hhsr.kernels.nearest_part import box_bound, nearest_on_part
+from hhsr.kernels.nearest_slab import nearest_on_slab
+from hhsr.kernels.patch import (
     BEST,
     BEST_T,
     FAR,
@@ -41,12 +44,8 @@ from hhsr.kernels.nearest import (
     START,
     TOLERANCE,
     VECTOR,
-    nearest_on_leaves,
     offer,
-    owner_planes,
 )
-from hhsr.kernels.nearest_part import box_bound, nearest_on_part
-from hhsr.kernels.nearest_slab import nearest_on_slab
 from hhsr.kernels.polygon import ROOM, segment_to_segment
 from hhsr.kernels.tree import (
     into_leaf,

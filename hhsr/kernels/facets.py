@@ -1,8 +1,9 @@
 """The surface of all model leaves as flat facets with proven thickness, under one hierarchy of discs.
 
-A facet is a cell of a leaf's map whose surface may lie in the leaf's region. Facets are sorted along a Morton curve over each
-face; a square of four makes a node of level 0 (codes of −1 fill up where one is missing), four nodes one of the next level:
-no links are stored. A disc holds all surface of its
+A facet is a cell of a leaf's map whose surface may lie in the leaf's region. Facets are sorted along a Morton curve
+over each
+face; a square of four makes a node of level 0 (codes of −1 fill up where one is missing), four nodes one of the next
+level: no links are stored. A disc holds all surface of its
 facets: no farther than THICK from the plane through its centre (slots 0–2) across its normal (3–5), and within that no
 farther than RADIUS from the centre. Discs are in the tree's frame, those of nodes float32, rounded outward.
 """
@@ -140,7 +141,7 @@ def _spread(x):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def place_facets(blob, codes, keys, groups):
-    """Fill (m,) places of the facets along a Morton curve over each face of each leaf, and (m,) the square of four that each is of."""
+    """Fill (m,) places of the facets along a Morton curve over each face, and (m,) the square of four of each."""
     ints = integers(blob)
     for q in range(codes.shape[0]):
         owner, base, cell = codes[q] >> 24, (codes[q] >> 9) & 0x7FFF, (codes[q] >> 1) & 0xFF

@@ -1,8 +1,9 @@
 """The foot of a point on one smooth leaf: Newton's steps on exact jets, and the proof that nothing lies nearer.
 
-At a point of contact x with the chart's second derivatives bounded by `bend`, the surface rises above the tangent plane at x by
-no more than κ/2 times the squared distance from x: so the ball of radius 1/κ that touches x from the point's side is free of
-surface, and with it every smaller ball inside it.
+At a point of contact x with the chart's second derivatives bounded by `bend`, the surface rises above the tangent
+plane at x by
+no more than κ/2 times the squared distance from x: so the ball of radius 1/κ that touches x from the point's side is
+free of surface, and with it every smaller ball inside it.
 """
 
 import math
@@ -57,7 +58,7 @@ def ball_is_free(px, py, pz, radius, face, a, b, way, w, ga, gb, bend_lo, bend_h
 
 @njit(cache=True, error_model="numpy")
 def step_to_foot(px, py, pz, face, a, b, w, ga, gb):
-    """Return (a, b, m) of the foot of a point on the plane of a jet: the next point of contact; m ≤ 0 where there is none."""
+    """Return (a, b, m) of the foot of a point on a jet's plane, the next contact; m ≤ 0 where there is none."""
     gx, gy, gz = plane_of(face, a, b, w, ga, gb)
     h = (gx * px + gy * py + gz * pz - 1.0) / (gx * gx + gy * gy + gz * gz)
     return chart_of(face, px - h * gx, py - h * gy, pz - h * gz)
@@ -65,10 +66,11 @@ def step_to_foot(px, py, pz, face, a, b, w, ga, gb):
 
 @njit(cache=True, error_model="numpy")
 def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, foot):
-    """Return (distance, proven) of a point of the owner's region (leaf's frame) to its own leaf along the point's chart.
+    """Return (distance, proven) of a point of the owner's region (leaf's frame) to its own leaf along the point's
+    chart.
 
-    foot: (3,) filled with the surface point at that distance, leaf frame. Distance is infinite where nothing was found in the
-    region. Proven: no surface of the whole solid lies nearer than the distance less the tolerance.
+    foot: (3,) filled with the surface point at that distance, leaf frame. Distance is infinite where nothing was found
+    in the region. Proven: no surface of the whole solid lies nearer than the distance less the tolerance.
     """
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
     leaf = ints[o + OWNER_RECORD]

@@ -15,8 +15,8 @@ EDGE_COUNT, EDGE_FLOATS = 6, 7
 PLANE_COUNT, PLANE_FLOATS = 8, 9
 POSE = 10  # float slot: rotation (9) and translation (3), tree frame to LPS
 LOWEST, HIGHEST = 11, 12  # float slots of the box of the solid, tree frame
-# Facets (hhsr.kernels.facets): how many, integer slot of their codes, integer slot of (levels, then start among the float32
-# tables and number of nodes of each).
+# Facets (hhsr.kernels.facets): how many, integer slot of their codes, integer slot of (levels, then start among the
+# float32 tables and number of nodes of each).
 FACET_COUNT, FACET_CODES, FACET_LEVELS = 13, 14, 15
 # Voxels (hhsr.kernels.voxels): integer slot of (nx, ny, nz), float slot of (lowest corner 3, side, 1/side), slot of the
 # bytes; 0 where there are none.
@@ -34,13 +34,14 @@ OWNER_KIND, OWNER_RECORD, OWNER_PLANES, OWNER_PLANE_FLOATS, OWNER_NODE, OWNER_BO
 # Model leaf record, integers: where its numbers (float slots), lists (integer slots) and tables (float32 slots) lie.
 HALF_AXES, AZIMUTH, AZIMUTH_COUNT, ELEVATION, ELEVATION_COUNT = 0, 1, 2, 3, 4
 # The centres that are not 0 everywhere in a block of directions, copied for each block: float slot of all blocks' data,
-# and integer slots of 6·8·8 + 1 offsets into it. A block holds 5 rows, each as long as it has centres, padded with zeros
-# to a multiple of LANES: unit vector x, y, z; 1/(1 − cos σ); weight.
+# and integer slots of 6·8·8 + 1 offsets into it. A block holds 5 rows, each as long as it has centres, padded with
+# zeros to a multiple of LANES: unit vector x, y, z; 1/(1 − cos σ); weight.
 BLOCK_DATA, BLOCKS = 5, 7
 CELL_BITS = 6  # log₂ of the base cells a face side
 FRAME, ROTATED = 8, 9  # float slots: centre 3, rotation 9 (leaf to tree)
-# Cube map: base cells a face side; integer slot of one word a base cell, `first cell · 16 + 8 · surface + k` where it is
-# parted into 2^k × 2^k cells, and has surface in the leaf's region or not; float32 slots of the cells and of the pyramid of ranges.
+# Cube map: base cells a face side; integer slot of one word a base cell, `first cell · 16 + 8 · surface + k` where it
+# is parted into 2^k × 2^k cells, and has surface in the leaf's region or not; float32 slots of the cells and of the
+# pyramid of ranges.
 CELLS, PARTING, CELL_TABLE, RANGE_TABLE = 10, 11, 12, 13
 BEND_TABLE = 15  # float32 slot of the bend of each base cell, lowest and highest
 BOX = 14  # float slots: box of the leaf in its own frame 6, least and greatest |p|∞ of its surface

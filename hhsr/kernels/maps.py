@@ -1,6 +1,7 @@
 """The certified cube map of a leaf: linear models of its cells, and a pyramid of ranges over the base cells.
 
-A face has n² base cells, each parted into 2^k × 2^k cells where the surface needs it. Tables are float32, rounded outward.
+A face has n² base cells, each parted into 2^k × 2^k cells where the surface needs it. Tables are float32, rounded
+outward.
 The pyramid holds the levels n, n/2, …, 2, 1 one after another, finest first, each as (face, i, j).
 """
 
@@ -162,7 +163,8 @@ def _write(out, value, ga, gb, error, half, da, db, bend_lo, bend_hi):
 def prove_base(blob, leaf, n, planes, count, models, spans, thickness):
     """Prove the base cells of a leaf.
 
-    models: (6, n, n, CELL_SIZE) float32. spans: (6, n, n, 2) range of W. thickness: (6, n, n) mm, how far surface and plane
+    models: (6, n, n, CELL_SIZE) float32. spans: (6, n, n, 2) range of W. thickness: (6, n, n) mm, how far surface and
+    plane
     can lie apart in the thickest of a cell's four quarters; 0 where the surface lies outside the leaf's region, so that
     nothing asks for it.
     """

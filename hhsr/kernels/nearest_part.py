@@ -4,8 +4,8 @@ import math
 
 from numba import njit
 
-from hhsr.kernels.nearest import BEST, LENGTH2, START, TOLERANCE, VECTOR, offer
 from hhsr.kernels.part import TRIANGLES, part_arrays
+from hhsr.kernels.patch import BEST, LENGTH2, START, TOLERANCE, VECTOR, offer
 from hhsr.kernels.polygon import clip_polygon, polygon_to_segment, segment_to_segment
 
 

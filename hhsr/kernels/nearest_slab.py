@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from hhsr.kernels.maps import outside_region
-from hhsr.kernels.nearest import BEST, FINEST, START, TOLERANCE, VECTOR, distance_to, offer
+from hhsr.kernels.patch import BEST, FINEST, START, TOLERANCE, VECTOR, distance_to, offer
 from hhsr.kernels.polygon import clip_polygon, polygon_to_segment
 from hhsr.kernels.slab import (
     LOBE_COUNT,

@@ -28,6 +28,7 @@ from hhsr.kernels.layout import (
     VALUE,
 )
 from hhsr.kernels.maps import cell_at, level_start
+from hhsr.kernels.solve import share_to_t, solve_in_cell
 
 PIECES = 64  # depth of the bisection
 UNDECIDED = 2
@@ -75,7 +76,7 @@ def _index(x, side):
 
 @njit(cache=True, error_model="numpy")
 def _border(a0, b0, a1, b1, side):
-    """Return the share at which a piece meets the middle one of the cell borders within it; −1 if it lies in one cell."""
+    """Return the share at which a piece meets the middle one of the cell borders in it; −1 within one cell."""
     i0, i1 = _index(a0, side), _index(a1, side)
     if i0 != i1:
         x = ((2.0 * ((i0 + i1 + 1) // 2) / side - 1.0) - a0) / (a1 - a0)
@@ -87,44 +88,6 @@ def _border(a0, b0, a1, b1, side):
         if 1e-9 < x < 1.0 - 1e-9:
             return x
     return -1.0
-
-
-@njit(cache=True, error_model="numpy")
-def solve_in_cell(blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, x0, x1, f0, f1, slope, steep, tolerance):
-    """Return the share x in [x0, x1] where w = W: Newton on the proven slope, safeguarded by the bracket.
-
-    f0, f1: w − W (exact, or its linear model) at x0 and x1, of opposite sign. slope, steep: least and greatest
-    |d(w − W)/dx|, proven: a step by their mean from an exact value leaves no more than their spread can.
-    """
-    mean, spread = 0.5 * (slope + steep), 0.5 * (steep - slope)
-    lo, hi, f_lo, f_hi = x0, x1, f0, f1
-    x = lo + (hi - lo) * f_lo / (f_lo - f_hi)
-    for _ in range(60):
-        x = min(max(x, lo), hi)
-        f = w0 + x * (w1 - w0) - inverse_radius(blob, ints, leaf, face, a0 + x * (a1 - a0), b0 + x * (b1 - b0))
-        if abs(f) <= slope * tolerance:
-            return x
-        if abs(f) * spread <= tolerance * mean * slope:
-            return min(max(x + (abs(f) if (f > 0.0) == (f_lo > 0.0) else -abs(f)) / mean, lo), hi)
-        if (f > 0.0) == (f_lo > 0.0):
-            lo, f_lo = x, f
-            f_hi = 0.5 * f_hi if _ > 2 else f_hi
-        else:
-            hi, f_hi = x, f
-            f_lo = 0.5 * f_lo if _ > 2 else f_lo
-        if hi - lo <= tolerance:
-            return 0.5 * (lo + hi)
-        x = lo + (hi - lo) * f_lo / (f_lo - f_hi)
-        if _ > 12:
-            x = 0.5 * (lo + hi)
-    return 0.5 * (lo + hi)
-
-
-@njit(cache=True, error_model="numpy")
-def share_to_t(x, t0, t1, w0, w1):
-    """Return t of the point at share x of a piece in the chart: t is linear in space, x in the projection."""
-    p, q = (1.0 - x) * w0, x * w1
-    return (t0 * p + t1 * q) / (p + q)
 
 
 @njit(cache=True, error_model="numpy")
@@ -288,8 +251,8 @@ def _face_crossings(
                         stray = max(bend_hi, -bend_lo) * math.sqrt(far2)
                         verdict, state, count = _settle(
                             blob, ints, leaf, face, t0, a0, b0, w0, t1, a1, b1, w1,
-                            a, b, value + 0.5 * (up + down), ga, gb, 0.5 * (up - down) + 1e-12 * value, stray, stray, False,
-                            speed, resolution, tolerance, state, out, count,
+                            a, b, value + 0.5 * (up + down), ga, gb, 0.5 * (up - down) + 1e-12 * value, stray, stray,
+                            False, speed, resolution, tolerance, state, out, count,
                         )  # fmt: skip
                 if verdict == UNDECIDED:
                     value, ga, gb, error, sa, sb, lo, hi, _, _ = cell_model(

@@ -36,8 +36,8 @@ def scale_on_circle(cosine, sine, centres, inverse_extent, weights):
     return total
 
 
-# e^(−t/2) on [−1, 1]: Chebyshev interpolation of degree 11 (error 2.4e-16) in powers of t, from 40 digits. No call of the
-# C library stands in the loop then, and the compiler runs it four centres at a time.
+# e^(−t/2) on [−1, 1]: Chebyshev interpolation of degree 11 (error 2.4e-16) in powers of t, from 40 digits. No call of
+# the C library stands in the loop then, and the compiler runs it four centres at a time.
 _POWERS = (
     0.9999999999999998,
     -0.49999999999999994,
@@ -60,8 +60,8 @@ _MIDDLE = math.exp(-2.0)
 def gaussian_sum(cx, cy, cz, inverse_extents, weights, ux, uy, uz):
     """Return Σ w λ(h) of a unit direction over rows (n,) of centres: `scale_on_sphere` at a fifth of its time.
 
-    Right to 1e-13·Σ|w| (both are: what rounding leaves of 1 − u·c). A row of zeros adds nothing. Reassociation is allowed
-    here so that the sum runs in lanes; NaN and infinity keep their meaning.
+    Right to 1e-13·Σ|w| (both are: what rounding leaves of 1 − u·c). A row of zeros adds nothing. Reassociation is
+    allowed here so that the sum runs in lanes; NaN and infinity keep their meaning.
     """
     total = 0.0
     for j in range(weights.shape[0]):

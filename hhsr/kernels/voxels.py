@@ -1,6 +1,7 @@
 """A grid of cubes about the solid, each proven inside, proven outside, or left to the formulas.
 
-A voxel's byte is 0 where nothing is proven, else ± (its Chebyshev distance, in voxels, to the nearest such one): positive inside.
+A voxel's byte is 0 where nothing is proven, else ± (its Chebyshev distance, in voxels, to the nearest such one):
+positive inside.
 So a segment leaps over what is decided, and most points need one byte.
 """
 

@@ -1,0 +1,107 @@
+"""What queries return, and how what they are asked is brought into rows."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hhsr.check import as_points
+from hhsr.errors import InputError
+from hhsr.model import FloatArray, IntArray
+
+OnInvalid = Literal["raise", "mark"]
+
+
+class Crossings(NamedTuple):
+    """Where segments cross a shape's surface; segment i has rows offsets[i] … offsets[i + 1], in order.
+
+    offsets: (n + 1,). t: (m,) share of the segment, in [0, 1]. points: (m, 3) LPS mm. entering: (m,) bool.
+    valid: (n,) bool, False where a segment was not finite (asked with on_invalid="mark").
+    """
+
+    offsets: IntArray
+    t: FloatArray
+    points: FloatArray
+    entering: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
+
+
+class Clearance(NamedTuple):
+    """Clearance of capsules, with the closest pair.
+
+    clearance: (...) mm. t: (...) share of the segment where the axis is nearest (deepest, where it enters).
+    on_axis, on_surface: (..., 3) the pair of points, LPS mm.
+    """
+
+    clearance: FloatArray
+    t: FloatArray
+    on_axis: FloatArray
+    on_surface: FloatArray
+
+
+class Profile(NamedTuple):
+    """What lies along segments. t: (n,) shares. distance: (..., n) signed, mm. inside_mm: (...) length inside."""
+
+    t: FloatArray
+    distance: FloatArray
+    inside_mm: Any
+
+
+def one_row(points: ArrayLike) -> FloatArray | None:
+    """Return a fresh (1, 3) of a single point given as a float64 array (3,), else None: the way of single calls.
+
+    A copy has one layout and may be written, whatever came in, so that the kernels are never compiled anew for it.
+    """
+    if type(points) is np.ndarray and points.shape == (3,) and points.dtype == np.float64:
+        row = np.empty((1, 3))
+        row[0] = points
+        return row
+    return None
+
+
+def crossings_of_one(first: FloatArray, last: FloatArray, t: FloatArray, begins: bool) -> Crossings:
+    """Return the crossings of one segment (1, 3) → (1, 3) from its t (m,) and whether it starts inside."""
+    count = len(t)
+    return Crossings(
+        np.array([0, count]),
+        t,
+        first + t[:, None] * (last - first) if count else np.empty((0, 3)),
+        np.array([(k % 2 == 0) != begins for k in range(count)], dtype=np.bool_),
+        np.array([True]),
+    )
+
+
+def curve(points: ArrayLike) -> FloatArray:
+    """Return the points of a curve (k, 3), k ≥ 2."""
+    rows = as_points(points)
+    if rows.ndim != 2 or len(rows) < 2:
+        raise InputError(f"points: got shape {rows.shape}, expected (k, 3) with k ≥ 2 points along a curve")
+    return rows
+
+
+def marks(on_invalid: str) -> bool:
+    """Return whether rows that are not finite are to be marked instead of refused."""
+    if on_invalid not in ("raise", "mark"):
+        raise InputError(f'on_invalid: got {on_invalid!r}, expected "raise" or "mark"')
+    return on_invalid == "mark"
+
+
+def scalar(array: NDArray[Any]) -> Any:
+    """Return a Python scalar for a 0-d array: one point in, one answer out."""
+    return array.item() if array.ndim == 0 else array
+
+
+def broadcast_segments(starts: ArrayLike, ends: ArrayLike) -> tuple[FloatArray, FloatArray, tuple[int, ...]]:
+    """Return starts and ends as (n, 3), and the shape (...) of the answer; one start may serve many ends."""
+    first, last = as_points(starts, "starts"), as_points(ends, "ends")
+    if first.shape != last.shape:
+        try:
+            first, last = np.broadcast_arrays(first, last)
+        except ValueError as error:
+            raise InputError(
+                f"starts and ends: got shapes {first.shape} and {last.shape}, expected one end for each start"
+            ) from error
+        first, last = np.ascontiguousarray(first), np.ascontiguousarray(last)
+    return first.reshape(-1, 3), last.reshape(-1, 3), first.shape[:-1]

@@ -1,0 +1,238 @@
+"""A cell's surface against a point or a segment: bounded by its flat quad, settled by exact jets or by parting it.
+
+A search is a float array: its slots hold the segment and the best point so far.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from hhsr.kernels.cell import cell_model, chart_of, direction_of, inverse_radius
+from hhsr.kernels.foot import ball_is_free, step_to_foot
+from hhsr.kernels.jet import has_jets, inverse_radius_jet
+from hhsr.kernels.layout import BEND_HI, BEND_LO, BOX, SLOPE_A, SLOPE_B, VALUE
+from hhsr.kernels.maps import (
+    cell_corners,
+    cell_sphere,
+    model_thickness,
+    outside_region,
+    plane_of,
+    quad_radius,
+    quad_radius_ok,
+    ray_thickness,
+)
+from hhsr.kernels.polygon import clip_polygon, polygon_to_segment
+
+# Slots of a search: start 3, vector 3, squared length; best distance, t, point 3 (owner's frame); tolerance.
+START, VECTOR, LENGTH2, BEST, BEST_T, FOOT, TOLERANCE = 0, 3, 6, 7, 8, 9, 12
+SEARCH_SIZE = 16
+LATE = 256  # room for pending nodes
+NODE_ROOM = 256  # room for facets to be settled, and for parts of one
+FAR = 1e150  # mm: no surface point found yet; finite, so that "no surface here" (infinite) is beyond it
+FINEST = 1e-5  # mm: a piece of surface smaller than this is taken as a point
+
+
+@njit(cache=True, error_model="numpy")
+def distance_to(search, x, y, z):
+    """Return (distance, t) of a point to the search's segment."""
+    dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
+    rx, ry, rz = x - search[START], y - search[START + 1], z - search[START + 2]
+    t = 0.0
+    if search[LENGTH2] > 0.0:
+        t = min(max((rx * dx + ry * dy + rz * dz) / search[LENGTH2], 0.0), 1.0)
+        rx, ry, rz = rx - t * dx, ry - t * dy, rz - t * dz
+    return math.sqrt(rx * rx + ry * ry + rz * rz), t
+
+
+@njit(cache=True, error_model="numpy")
+def offer(search, distance, t, x, y, z):
+    """Take a surface point as the best one if it is nearer."""
+    if distance < search[BEST]:
+        search[BEST], search[BEST_T] = distance, t
+        search[FOOT], search[FOOT + 1], search[FOOT + 2] = x, y, z
+
+
+@njit(cache=True, error_model="numpy")
+def offer_patch_point(blob, ints, leaf, planes, count, search, face, x, y, z, shrink):
+    """Project a point near a patch along its ray to the exact surface and offer it, if it lies in the region.
+
+    shrink: mm; where the projection leaves the region by a plane, the point is moved back by its excess and this much.
+    """
+    for _ in range(3):
+        a, b, m = chart_of(face, x, y, z)
+        if not (m > 0.0 and abs(a) <= 1.0 + 1e-9 and abs(b) <= 1.0 + 1e-9):
+            return
+        w = inverse_radius(blob, ints, leaf, face, a, b)
+        ux, uy, uz = direction_of(face, a, b)
+        sx, sy, sz = ux / w, uy / w, uz / w
+        worst, at = 1e-9, -1
+        for k in range(count):
+            o = planes + 4 * k
+            h = blob[o] * sx + blob[o + 1] * sy + blob[o + 2] * sz - blob[o + 3]
+            if h > worst:
+                worst, at = h, o
+        if at < 0:
+            distance, t = distance_to(search, sx, sy, sz)
+            offer(search, distance, t, sx, sy, sz)
+            return
+        back = worst + shrink
+        x, y, z = sx - back * blob[at], sy - back * blob[at + 1], sz - back * blob[at + 2]
+
+
+@njit(cache=True, error_model="numpy")
+def cell_bound(blob, ints, leaf, planes, count, search, face, a, b, half, value, ga, gb, error, corners, spare):
+    """Return a lower bound of the segment's distance to the cell's surface in the region; offer a point of it.
+
+    Infinite where no surface of the cell lies in the region. A cell too steep for its plane is bounded by a sphere.
+    """
+    if not quad_radius_ok(value, ga, gb, error, half, half):
+        reach = abs(ga) * half + abs(gb) * half + error
+        lo = max(value - reach, 1.0 / blob[ints[leaf + BOX] + 7])
+        x, y, z, radius = cell_sphere(face, a, b, half, half, value, ga, gb, error, lo, value + reach)
+        if outside_region(blob, planes, count, x, y, z, radius):
+            return np.inf
+        distance, _ = distance_to(search, x, y, z)
+        x, y, z = direction_of(face, a, b)
+        offer_patch_point(blob, ints, leaf, planes, count, search, face, x, y, z, radius)
+        return distance - radius
+    thick = model_thickness(face, a, b, half, half, value, ga, gb, error)
+    gx, gy, gz = plane_of(face, a, b, value, ga, gb)
+    along = 0.0
+    if search[LENGTH2] == 0.0:
+        # A point: its distance to the whole plane is often bound enough.
+        along = abs(gx * search[START] + gy * search[START + 1] + gz * search[START + 2] - 1.0) / math.sqrt(
+            gx * gx + gy * gy + gz * gz
+        )
+        limit = search[BEST] - search[TOLERANCE]
+        if along - thick > limit:
+            return along - thick
+        # And within it: no point of the quad is farther from its middle than this, nor the surface by more than
+        # `slant`.
+        slant = ray_thickness(face, a, b, half, half, value, ga, gb, error)
+        x, y, z = direction_of(face, a, b)
+        rx, ry, rz = search[START] - x / value, search[START + 1] - y / value, search[START + 2] - z / value
+        aside = math.sqrt(max(rx * rx + ry * ry + rz * rz - along * along, 0.0))
+        aside -= quad_radius(face, a, b, half, value, ga, gb) + slant
+        if aside > 0.0:
+            low = max(along - thick, 0.0)
+            low = math.sqrt(low * low + aside * aside)
+            if low > limit:
+                return low
+    slant = ray_thickness(face, a, b, half, half, value, ga, gb, error)
+    cell_corners(face, a, b, half, value, ga, gb, corners)
+    size = 4
+    for k in range(count):
+        o = planes + 4 * k
+        size = clip_polygon(corners, size, spare, blob[o], blob[o + 1], blob[o + 2], blob[o + 3] + slant)
+        if size == 0:
+            return np.inf
+    distance, _, x, y, z = polygon_to_segment(
+        corners,
+        size,
+        gx,
+        gy,
+        gz,
+        search[START],
+        search[START + 1],
+        search[START + 2],
+        search[VECTOR],
+        search[VECTOR + 1],
+        search[VECTOR + 2],
+    )
+    if search[LENGTH2] == 0.0:
+        # Across the plane the surface strays by `thick`, within it by no more than `slant`.
+        aside = math.sqrt(max(distance * distance - along * along, 0.0)) - slant
+        low = max(along - thick, 0.0)
+        if aside > 0.0:
+            low = math.sqrt(low * low + aside * aside)
+    else:
+        low = distance - slant
+    if low < search[BEST] - search[TOLERANCE]:
+        offer_patch_point(blob, ints, leaf, planes, count, search, face, x, y, z, 2.0 * slant)
+    return low
+
+
+@njit(cache=True, error_model="numpy")
+def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, bend_lo, bend_hi, corners, spare, rects):
+    """Part a cell until what is left of it can hold no nearer point. rects: (NODE_ROOM, 6) scratch.
+
+    Parts are bounded from their exact jet and the bend of what they are a part of, which is proven anew two halvings
+    on; by proven models alone where there are no jets.
+    """
+    jets = has_jets(ints, leaf)
+    rects[0, 0], rects[0, 1], rects[0, 2], rects[0, 3] = a, b, half, -1.0
+    rects[0, 4], rects[0, 5] = bend_lo, bend_hi
+    depth = 1
+    first = True
+    while depth > 0:
+        depth -= 1
+        a, b, half, low = rects[depth, 0], rects[depth, 1], rects[depth, 2], rects[depth, 3]
+        bend_lo, bend_hi = rects[depth, 4], rects[depth, 5]
+        if low > search[BEST] - search[TOLERANCE]:
+            continue
+        if not first and jets:
+            _, _, _, _, _, _, _, _, lo, hi = cell_model(blob, ints, leaf, face, a, b, half, half)
+            bend_lo, bend_hi = max(bend_lo, lo), min(bend_hi, hi)
+        first = False
+        half *= 0.5
+        base = depth
+        for corner in range(4):
+            ca, cb = a + (half if corner & 1 else -half), b + (half if corner & 2 else -half)
+            w = 0.0
+            if jets and bend_hi < math.inf:
+                w, ga, gb = inverse_radius_jet(blob, ints, leaf, face, ca, cb)
+                if w > 0.0:
+                    # Over the part W − tangent lies in half² [min(bend_lo, 0), max(bend_hi, 0)].
+                    up, down = half * half * max(bend_hi, 0.0), half * half * min(bend_lo, 0.0)
+                    value, error = w + 0.5 * (up + down), 0.5 * (up - down) + 1e-12 * w
+            if w == 0.0:
+                value, ga, gb, error, _, _, _, _, _, _ = cell_model(blob, ints, leaf, face, ca, cb, half, half)
+            low = cell_bound(
+                blob, ints, leaf, planes, count, search, face, ca, cb, half, value, ga, gb, error, corners, spare
+            )
+            if low > search[BEST] - search[TOLERANCE]:
+                continue
+            if half / value < FINEST:
+                x, y, z = direction_of(face, ca, cb)
+                if not outside_region(blob, planes, count, x / value, y / value, z / value, FINEST):
+                    distance, t = distance_to(search, x / value, y / value, z / value)
+                    offer(search, distance, t, x / value, y / value, z / value)
+                continue
+            # Insert so that the nearest is parted first.
+            k = depth
+            while k > base and rects[k - 1, 3] < low:
+                for q in range(6):
+                    rects[k, q] = rects[k - 1, q]
+                k -= 1
+            rects[k, 0], rects[k, 1], rects[k, 2], rects[k, 3] = ca, cb, half, low
+            rects[k, 4], rects[k, 5] = bend_lo, bend_hi
+            depth += 1
+
+
+@njit(cache=True, error_model="numpy")
+def settle_cell(blob, ints, tab, leaf, planes, count, search, face, o, a, b, half, corners, spare, rects):
+    """Settle a cell for good: by an exact jet near the foot of a point if that proves it, else by parting it."""
+    bend_lo, bend_hi = np.float64(tab[o + BEND_LO]), np.float64(tab[o + BEND_HI])
+    if search[LENGTH2] == 0.0 and bend_hi < math.inf:
+        px, py, pz = search[START], search[START + 1], search[START + 2]
+        ca, cb = a, b
+        value, ga, gb = np.float64(tab[o + VALUE]), np.float64(tab[o + SLOPE_A]), np.float64(tab[o + SLOPE_B])
+        for _ in range(2):
+            na, nb, m = step_to_foot(px, py, pz, face, ca, cb, value, ga, gb)
+            if not m > 0.0:
+                break
+            ca, cb = min(max(na, a - half), a + half), min(max(nb, b - half), b + half)
+            value, ga, gb = inverse_radius_jet(blob, ints, leaf, face, ca, cb)
+            if value == 0.0:
+                break
+            x, y, z = direction_of(face, ca, cb)
+            x, y, z = x / value, y / value, z / value
+            if not outside_region(blob, planes, count, x, y, z, 1e-9):
+                distance, t = distance_to(search, x, y, z)
+                offer(search, distance, t, x, y, z)
+            way = half + max(abs(ca - a), abs(cb - b))
+            radius = search[BEST] - search[TOLERANCE]
+            if radius <= 0.0 or ball_is_free(px, py, pz, radius, face, ca, cb, way, value, ga, gb, bend_lo, bend_hi):
+                return
+    refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, bend_lo, bend_hi, corners, spare, rects)
