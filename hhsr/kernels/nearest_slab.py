@@ -72,6 +72,27 @@ def _offer_strip_point(blob, ints, slab, lobe, planes, count, search, x, y, z, s
 
 
 @njit(cache=True, error_model="numpy")
+def _within_another(blob, ints, slab, lobe, u, v, extent, t, half_t):
+    """Return whether a disc of the plane about (u, v), at t ± half_t, lies inside another lobe: no surface then."""
+    for k in range(ints[slab + LOBE_COUNT]):
+        other = ints[slab + LOBES] + LOBE_INT_SIZE * k
+        if other == lobe:
+            continue
+        o = ints[other + LOBE_TABLES]
+        du, dv = u - blob[o], v - blob[o + 1]
+        away = math.sqrt(du * du + dv * dv)
+        if away <= extent:
+            continue
+        angle, half = math.atan2(dv, du), math.asin(extent / away) + 1e-12
+        first, last = int((angle - half + math.pi) / STEP), int((angle + half + math.pi) / STEP)
+        if first == last and 0 <= first < TABLE and angle - half > -math.pi:
+            _, _, _, _, low, _ = lobe_model(blob, ints, other, first, angle, t, half, half_t)
+            if away + extent < low:
+                return True
+    return False
+
+
+@njit(cache=True, error_model="numpy")
 def strip_bound(blob, ints, slab, lobe, segment, planes, count, search, angle, t, half, half_t, corners, spare):
     """Return a lower bound of the segment's distance to a piece of strip in the region; offer a point of it.
 
@@ -92,6 +113,11 @@ def strip_bound(blob, ints, slab, lobe, segment, planes, count, search, angle, t
         + (abs(ga) * half + abs(gt) * half_t + error) * half
         + size_r * half * half * half / 6.0
     ) * (1.0 + 1e-9)
+    if ints[slab + LOBE_COUNT] > 1:
+        extent = abs(ga) * half + abs(gt) * half_t + error + size_r * half + thick
+        u, v = blob[o] + r * cosine, blob[o + 1] + r * sine
+        if _within_another(blob, ints, slab, lobe, u, v, extent, t, half_t):
+            return np.inf
     for corner in range(4):
         da = half if corner == 1 or corner == 2 else -half
         dt = half_t if corner >= 2 else -half_t
