@@ -10,13 +10,13 @@ import numba
 import numpy as np
 
 from hhsr.fitting.lookahead import Piece
-from hhsr.fitting.refine import figures, improved, mending_rows
+from hhsr.fitting.refine import Misses, figures, improved, mending_rows
 from hhsr.fitting.rows import Rows
 from hhsr.fitting.scale_field import NONE, costs_of_dropping, fit_ellipsoid, grid_for, leaf_of, select_centres
 from hhsr.fitting.solid import Solid
 from hhsr.fitting.spend import counts_within
 from hhsr.fitting.task import Task, hint_rows, hold_rows, start_rows, task_of
-from hhsr.model import IntArray, ModelLeaf, ScaleField, frozen
+from hhsr.model import FloatArray, IntArray, ModelLeaf, ScaleField, frozen
 
 T = TypeVar("T")
 
@@ -52,7 +52,33 @@ class Fitted(NamedTuple):
     worst: int
 
 
-def fit_leaves(solid: Solid, pieces: list[Piece], budget: int, effort: Effort) -> Fitted:
+class Workshop:
+    """What the leaves of a solid's pieces start from, kept: many partings share pieces."""
+
+    def __init__(self, solid: Solid) -> None:
+        self.solid = solid
+        self._kept: dict[int, tuple[Piece, Task, FloatArray]] = {}
+
+    def prepare(self, pieces: list[Piece]) -> None:
+        """Look at the pieces that are new."""
+        new = [piece for piece in pieces if id(piece) not in self._kept]
+        for piece, found in zip(new, in_threads(lambda k: self._look(new[k]), len(new)), strict=True):
+            self._kept[id(piece)] = (piece, *found)
+
+    def task(self, piece: Piece) -> Task:
+        """Return a prepared piece's task."""
+        return self._kept[id(piece)][1]
+
+    def half_axes(self, piece: Piece) -> FloatArray:
+        """Return the (6,) half axes of a prepared piece's ellipsoid, mm."""
+        return self._kept[id(piece)][2]
+
+    def _look(self, piece: Piece) -> tuple[Task, FloatArray]:
+        task = task_of(self.solid, piece.region, piece.members, piece.centre, SEED)
+        return task, fit_ellipsoid(start_rows(task, self.solid).joined(hint_rows(task, self.solid)))
+
+
+def fit_leaves(workshop: Workshop, pieces: list[Piece], budget: int, effort: Effort) -> Fitted:
     """Return the leaves of the pieces within a budget of numbers.
 
     effort: a scout tells which parting is worth a thorough fit; without a round of swaps it tells the wrong one.
@@ -60,36 +86,31 @@ def fit_leaves(solid: Solid, pieces: list[Piece], budget: int, effort: Effort) -
     free = budget - LEAF_NUMBERS * len(pieces)
     if free < 0:
         raise ValueError(f"budget: got {budget} numbers for {len(pieces)} leaves, expected {LEAF_NUMBERS} for each")
+    solid = workshop.solid
+    workshop.prepare(pieces)
+    tasks = [workshop.task(piece) for piece in pieces]
     grid = grid_for(int(np.clip(effort.atoms * budget / len(pieces), *FINEST)))
-    tasks = in_threads(
-        lambda k: task_of(solid, pieces[k].region, pieces[k].members, pieces[k].centre, SEED), len(pieces)
-    )
-    axes = in_threads(
-        lambda k: fit_ellipsoid(start_rows(tasks[k], solid, pieces[k].centre).joined(hint_rows(tasks[k], solid))),
-        len(pieces),
-    )
-    bare = [leaf_of(p.centre, a, ScaleField(grid, NONE, frozen([]))) for p, a in zip(pieces, axes, strict=True)]
-    rows = [_first_rows(solid, t, leaf) for t, leaf in zip(tasks, bare, strict=True)]
-    limits = [int(2.0 * free / len(pieces)) + 1] * len(pieces)
+    none = ScaleField(grid, NONE, frozen([]))
+    bare = [leaf_of(p.centre, workshop.half_axes(p), none) for p in pieces]
+    rows = [
+        start_rows(task, solid).joined(hold_rows(task, solid, workshop.half_axes(piece)))
+        for task, piece in zip(tasks, pieces, strict=True)
+    ]
+    limits = [min(int(2.0 * free / len(pieces)) + 1, free)] * len(pieces)
     leaves = _chosen(bare, rows, [NONE] * len(pieces), limits, free)
-    best = _judged(solid, tasks, _refined(solid, tasks, leaves, effort.steps))
+    best, found = _refined(solid, tasks, leaves, effort.steps)
     for _ in range(effort.swaps):
-        swapped = _judged(solid, tasks, _refined(solid, tasks, _swapped(solid, tasks, best.leaves, free), effort.steps))
+        tried = _swapped(tasks, best.leaves, found, free)
+        swapped, after = _refined(solid, tasks, tried, effort.steps)
         if swapped.mean >= best.mean:
             break
-        best = swapped
+        best, found = swapped, after
     return best
 
 
-def _first_rows(solid: Solid, task: Task, leaf: ModelLeaf) -> Rows:
-    """Return the rows of a leaf that is still bare."""
-    half_axes = np.asarray(leaf.superquadric.half_axes)
-    return start_rows(task, solid, leaf.centre).joined(hold_rows(task, solid, half_axes))
-
-
-def _swapped(solid: Solid, tasks: list[Task], leaves: list[ModelLeaf], free: int) -> list[ModelLeaf]:
+def _swapped(tasks: list[Task], leaves: list[ModelLeaf], found: list[Misses], free: int) -> list[ModelLeaf]:
     """Return the leaves without the centres that all of them together miss least, and with better ones instead."""
-    rows = in_threads(lambda k: mending_rows(solid, tasks[k], leaves[k]), len(leaves))
+    rows = in_threads(lambda k: mending_rows(tasks[k], found[k]), len(leaves))
     costs = in_threads(lambda k: costs_of_dropping(rows[k], leaves[k]), len(leaves))
     limit = float(np.quantile(np.concatenate(costs), SWAPPED)) if sum(c.size for c in costs) else 0.0
     held = [leaf.scale_field.index[c > limit] for leaf, c in zip(leaves, costs, strict=True)]
@@ -113,22 +134,19 @@ def _chosen(
     ]
 
 
-def _refined(solid: Solid, tasks: list[Task], leaves: list[ModelLeaf], steps: int) -> list[ModelLeaf]:
-    """Return the leaves after some Gauss-Newton steps each."""
-    return in_threads(lambda k: improved(solid, tasks[k], leaves[k], steps, POWER), len(leaves))
-
-
-def _judged(solid: Solid, tasks: list[Task], leaves: list[ModelLeaf]) -> Fitted:
-    """Return the leaves with what they miss."""
-    found = in_threads(lambda k: figures(solid, tasks[k], leaves[k]), len(leaves))
+def _refined(solid: Solid, tasks: list[Task], leaves: list[ModelLeaf], steps: int) -> tuple[Fitted, list[Misses]]:
+    """Return the leaves after some Gauss-Newton steps each, with what they miss."""
+    done = in_threads(lambda k: improved(solid, tasks[k], leaves[k], steps, POWER), len(leaves))
+    found = [figures(task, leaf, misses) for task, (leaf, misses) in zip(tasks, done, strict=True)]
     count = solid.samples.points.shape[0]
-    return Fitted(
-        leaves,
+    fitted = Fitted(
+        [leaf for leaf, _ in done],
         sum(f.total for f in found) / count,
         max(f.largest for f in found),
         sum(f.unseen for f in found) / count,
         int(np.argmax([f.largest for f in found])),
     )
+    return fitted, [misses for _, misses in done]
 
 
 def in_threads(work: Callable[[int], T], count: int) -> list[T]:

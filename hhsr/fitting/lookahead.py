@@ -148,7 +148,7 @@ def best_centre(solid: Solid, members: IntArray, region: Region, power: float) -
     The misfit is the sum over all members, in mm (for power 1), from the few that are looked at.
     """
     inner = np.flatnonzero(region.holds(solid.inner))
-    few = members[:: max(members.size // COARSE, 1)]
+    few = members[:: max(members.size // COARSE, 1)].copy()
     if inner.size == 0:
         middle = solid.samples.points[members].mean(axis=0)
         inner = np.array([int(((solid.inner - middle) ** 2).sum(axis=1).argmin())])
@@ -186,7 +186,7 @@ def best_split(solid: Solid, piece: Piece, power: float) -> Split | None:
     if inner.size < 2:
         return None
     chosen = solid.inner[inner[_spread(solid.inner[inner], solid.depth[inner], CENTRES)]]
-    few = piece.members[:: max(piece.members.size // COARSE, 1)]
+    few = piece.members[:: max(piece.members.size // COARSE, 1)].copy()
     view = _View(solid, few, hidden(solid, chosen, few) ** power, chosen, least * few.size / piece.members.size, power)
     normal, offset, value = view.best_plane(fibonacci_sphere(2 * DIRECTIONS)[:DIRECTIONS], None, None)
     spread = float(np.ptp(solid.samples.points[few], axis=0).max())

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from hhsr.errors import FitError
-from hhsr.fitting.leaves import LEAF_NUMBERS, SCOUT, THOROUGH, Effort, Fitted, fit_leaves
+from hhsr.fitting.leaves import LEAF_NUMBERS, SCOUT, THOROUGH, Effort, Fitted, Workshop, fit_leaves
 from hhsr.fitting.lookahead import Parting
 from hhsr.fitting.options import FitOptions
 from hhsr.fitting.quantise import quantised
-from hhsr.fitting.solid import Solid, solid_of
+from hhsr.fitting.solid import solid_of
 from hhsr.model import FloatArray, IntArray, Node
 
 POSE_NUMBERS = 6
@@ -56,14 +56,14 @@ def fit_default(vertices: FloatArray, faces: IntArray, options: FitOptions) -> N
     expected = options.max_parameters if options.max_parameters is not None else USUAL_NUMBERS
     samples = int(np.clip(SAMPLES_A_NUMBER * expected, *SAMPLES))
     solid = solid_of(vertices, faces, samples, options.seed)
-    parting = Parting(solid)
+    parting, workshop = Parting(solid), Workshop(solid)
     if options.max_mean_error_mm is None and options.max_error_mm is None:
         budget = options.max_parameters if options.max_parameters is not None else USUAL_NUMBERS
-        return quantised(_spent(solid, parting, budget)[0])
+        return quantised(_spent(workshop, parting, budget)[0])
     most = options.max_parameters if options.max_parameters is not None else MOST_NUMBERS
     budget = min(64, most)
     while True:
-        node, fitted = _spent(solid, parting, budget)
+        node, fitted = _spent(workshop, parting, budget)
         met = (options.max_mean_error_mm is None or fitted.mean <= options.max_mean_error_mm) and (
             options.max_error_mm is None or fitted.largest <= options.max_error_mm
         )
@@ -72,33 +72,33 @@ def fit_default(vertices: FloatArray, faces: IntArray, options: FitOptions) -> N
         budget = min(budget + budget // 2, most)
 
 
-def _spent(solid: Solid, parting: Parting, budget: int) -> tuple[Node, Fitted]:
+def _spent(workshop: Workshop, parting: Parting, budget: int) -> tuple[Node, Fitted]:
     """Return the best tree within a budget of numbers, and how it fits."""
     if budget < POSE_NUMBERS + LEAF_NUMBERS:
         raise FitError(
             f"max_parameters: got {budget}, expected at least {POSE_NUMBERS + LEAF_NUMBERS}: a pose and one ellipsoid"
         )
-    scouts = _scouts(solid, parting, budget)
+    scouts = _scouts(workshop, parting, budget)
     best = min(scouts, key=lambda choice: choice.score)
-    parting, best = _mended(solid, parting, best, budget)
-    fitted = _fit(solid, parting, best.pieces, budget, THOROUGH)
+    parting, best = _mended(workshop, parting, best, budget)
+    fitted = _fit(workshop, parting, best.pieces, budget, THOROUGH)
     return parting.tree(fitted.leaves), fitted
 
 
-def _mended(solid: Solid, parting: Parting, best: Choice, budget: int) -> tuple[Parting, Choice]:
+def _mended(workshop: Workshop, parting: Parting, best: Choice, budget: int) -> tuple[Parting, Choice]:
     """Return the parting with cuts through the pieces of the largest misses, as long as that pays."""
     while best.fitted.largest > SPIKE * best.fitted.mean and best.pieces < budget // NUMBERS_A_PIECE:
         cut = parting.with_cut(best.pieces, best.fitted.worst)
         if cut is None:
             break
-        tried = Choice(best.pieces + 1, _fit(solid, cut, best.pieces + 1, budget, SCOUT))
+        tried = Choice(best.pieces + 1, _fit(workshop, cut, best.pieces + 1, budget, SCOUT))
         if tried.score >= best.score:
             break
         parting, best = cut, tried
     return parting, best
 
 
-def _scouts(solid: Solid, parting: Parting, budget: int) -> list[Choice]:
+def _scouts(workshop: Workshop, parting: Parting, budget: int) -> list[Choice]:
     """Return quick fits with one piece, two, … until more pieces stop to pay."""
     most = int(np.clip(budget // NUMBERS_A_PIECE, 1, MOST_PIECES))
     found: list[Choice] = []
@@ -107,7 +107,7 @@ def _scouts(solid: Solid, parting: Parting, budget: int) -> list[Choice]:
             break
         if count < most and _hopeless(parting, count):
             continue
-        found.append(Choice(count, _fit(solid, parting, count, budget, SCOUT)))
+        found.append(Choice(count, _fit(workshop, parting, count, budget, SCOUT)))
         best = min(found, key=lambda choice: choice.score)
         last = found[-1]
         if last.pieces - best.pieces >= PATIENCE or last.score > 1.5 * best.score:
@@ -126,7 +126,7 @@ def _hopeless(parting: Parting, count: int) -> bool:
     )
 
 
-def _fit(solid: Solid, parting: Parting, pieces: int, budget: int, effort: Effort) -> Fitted:
+def _fit(workshop: Workshop, parting: Parting, pieces: int, budget: int, effort: Effort) -> Fitted:
     """Return the fitted leaves of so many pieces."""
     numbers = budget - POSE_NUMBERS - CUT_NUMBERS * (pieces - 1)
-    return fit_leaves(solid, parting.pieces(pieces), numbers, effort)
+    return fit_leaves(workshop, parting.pieces(pieces), numbers, effort)

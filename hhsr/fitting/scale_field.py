@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from hhsr.fitting.rows import Rows
+from hhsr.kernels.greedy import orthogonal_selection
 from hhsr.kernels.refinement import chosen_rows
-from hhsr.kernels.selection import back_substituted, dictionary_rows, drop_costs, orthogonal_selection, solve_normal
+from hhsr.kernels.selection import atoms_of_cells, back_substituted, dictionary_rows, drop_costs, solve_normal
 from hhsr.model import CentreGrid, FloatArray, IntArray, ModelLeaf, ScaleField, Superquadric
 
 RATIO = 1.5
 SUPPORT = 3.3
 COARSEST = 20
 RIDGE = 1e-5
+CELL_EDGE = 16
 NO_ROTATION = np.zeros(0)
 NONE = np.zeros(0, np.int64)
 
@@ -52,10 +55,24 @@ def grid_for(finest: int) -> CentreGrid:
 
 def dictionary(grid: CentreGrid, directions: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
     """Return the compressed rows of λ over the whole grid, for (n, 3) unit directions."""
-    starts = np.concatenate([[0], np.cumsum(grid.sizes)]).astype(np.int64)
-    extents = grid.extents[starts[:-1]].copy()
-    pointer, index, value = dictionary_rows(np.ascontiguousarray(directions), grid.centres, starts, extents)
+    cell_pointer, cell_atoms = _atoms_of_cells(grid)
+    pointer, index, value = dictionary_rows(
+        np.ascontiguousarray(directions), grid.centres, 1.0 / grid.extents, CELL_EDGE, cell_pointer, cell_atoms
+    )
     return pointer, index, value
+
+
+@lru_cache(maxsize=4)
+def _atoms_of_cells(grid: CentreGrid) -> tuple[IntArray, IntArray]:
+    """Return which of the grid's centres each cell of directions has to ask."""
+    starts = np.concatenate([[0], np.cumsum(grid.sizes)]).astype(np.int64)
+    pointer, atoms = atoms_of_cells(grid.centres, starts, grid.extents[starts[:-1]].copy(), CELL_EDGE)
+    return pointer, atoms
+
+
+def ridge_of(extents: FloatArray) -> FloatArray:
+    """Return the ridge of centres by their extents, in units of the normal matrix's mean diagonal."""
+    return np.full(extents.size, RIDGE)
 
 
 def ellipsoid_radii(half_axes: FloatArray, directions: FloatArray) -> FloatArray:
@@ -101,7 +118,7 @@ def select_centres(rows: Rows, half_axes: FloatArray, grid: CentreGrid, count: i
     """
     pointer, index, value, scale, target = _system(rows, half_axes, lambda u: dictionary(grid, u))
     chosen, gains, triangle, right = orthogonal_selection(
-        pointer, index, value, scale, target, grid.size, count, RIDGE, held
+        pointer, index, value, scale, target, grid.size, count, ridge_of(grid.extents), held
     )
     return Selection(grid, chosen, gains, triangle, right, held.size)
 
@@ -112,7 +129,7 @@ def costs_of_dropping(rows: Rows, leaf: ModelLeaf) -> FloatArray:
     centres, extents = np.ascontiguousarray(field.grid.centres[field.index]), field.grid.extents[field.index]
     system = _system(rows, np.asarray(leaf.superquadric.half_axes), lambda u: chosen_rows(u, centres, extents))
     k = field.index.size
-    _, _, triangle, right = orthogonal_selection(*system, k, k, RIDGE, np.arange(k))
+    _, _, triangle, right = orthogonal_selection(*system, k, k, ridge_of(extents), np.arange(k))
     costs: FloatArray = drop_costs(triangle, right)
     return costs
 

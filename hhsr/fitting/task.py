@@ -26,22 +26,28 @@ class Task(NamedTuple):
     """A leaf's task as seen from its centre.
 
     points, normals: (n, 3) its samples; seen: (n,) which of them the centre sees through the solid.
+    along, radii, cosine: (s, 3), (s,) mm, (s,) of those that it sees: direction, distance, cosine with the normal.
     free: (r, 3) rays that meet the source within the region.
     behind: (b, 3) rays that leave the region inside the solid: there the leaf is cut off, and has to reach the plane.
     bound: (b,) mm that ρ has to be at least: the plane and some slack.
     urgency: (b,) by how much a miss counts more: falling short by a hair opens a void as deep as the solid is there.
     hint: (b,) mm, where the ray leaves the solid beyond the plane, at most half as far again.
+    directions: (s + r + b, 3) along, free and behind together.
     """
 
     region: Region
     points: FloatArray
     normals: FloatArray
     seen: BoolArray
+    along: FloatArray
+    radii: FloatArray
+    cosine: FloatArray
     free: FloatArray
     behind: FloatArray
     bound: FloatArray
     urgency: FloatArray
     hint: FloatArray
+    directions: FloatArray
 
 
 def task_of(solid: Solid, region: Region, members: IntArray, centre: FloatArray, seed: int) -> Task:
@@ -57,16 +63,22 @@ def task_of(solid: Solid, region: Region, members: IntArray, centre: FloatArray,
     slack = np.minimum(np.minimum(SLACK_OF_DEPTH * depth, SLACK_OF_REACH * reach), 0.5 * (hit - reach))
     urgency = np.minimum(depth / np.maximum(slack, 1e-9 * solid.size), MOST_URGENT)
     points, normals = solid.samples.points[members], solid.samples.normals[members]
+    seen = _in_sight(solid, points, normals, centre)
+    radii, along = polar(points[seen], centre)
     return Task(
         region,
         points,
         normals,
-        _in_sight(solid, points, normals, centre),
+        seen,
+        along,
+        radii,
+        np.einsum("ni,ni->n", along, normals[seen]),
         free,
         behind,
         reach + slack,
         urgency * np.sqrt(np.maximum(cosine, GRAZING)),
         np.minimum(hit, FARTHEST_HINT * reach),
+        np.concatenate([along, free, behind]),
     )
 
 
@@ -98,11 +110,10 @@ def ray_share(solid: Solid, rays: int) -> float:
     return 4.0 * np.pi / rays / solid.sample_area
 
 
-def start_rows(task: Task, solid: Solid, centre: FloatArray) -> Rows:
+def start_rows(task: Task, solid: Solid) -> Rows:
     """Return the rows before anything is fitted: the samples in sight, by max(|cos γ|, 0.2), and the bounds."""
-    radii, along = polar(task.points[task.seen], centre)
-    weights = np.maximum(np.einsum("ni,ni->n", along, task.normals[task.seen]), GRAZING)
-    samples = Rows(along, radii, weights, np.zeros(radii.size, dtype=bool))
+    weights = np.maximum(task.cosine, GRAZING)
+    samples = Rows(task.along, task.radii, weights, np.zeros(task.radii.size, dtype=bool))
     weights = np.sqrt(ray_share(solid, BOUND_RAYS)) * task.bound * task.urgency
     return samples.joined(Rows(task.behind, task.bound, weights, np.ones(task.bound.size, dtype=bool)))
 

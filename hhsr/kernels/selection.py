@@ -1,4 +1,4 @@
-"""Greedy choice of scale-field centres: sparse rows of the dictionary, orthogonal least squares (DESIGN §3)."""
+"""Sparse rows of the dictionary of scale-field centres, and small triangular systems (DESIGN §3)."""
 
 import math
 
@@ -9,56 +9,92 @@ from hhsr.kernels.sphere_rbf import wendland_gaussian
 
 
 @njit(cache=True, nogil=True)
-def _row_of_dictionary(ux, uy, uz, centres, starts, extents, index, value, at):
-    """Write the atoms that see a unit direction, ascending, from position `at` on; return the position after them.
-
-    centres: (M, 3) Fibonacci grids, z falling within a level. starts: (levels + 1,) first atom of each level.
-    extents: (levels,) 1 − cos σ. Writes nothing where the arrays are too short, but counts on.
-    """
-    room = index.shape[0]
-    polar = math.acos(min(max(uz, -1.0), 1.0))
-    for level in range(extents.shape[0]):
-        first, count = starts[level], starts[level + 1] - starts[level]
-        extent = extents[level]
-        support = math.acos(max(1.0 - extent, -1.0))
-        top = 1.0 if polar <= support else math.cos(polar - support)
-        bottom = -1.0 if polar + support >= math.pi else math.cos(polar + support)
-        low = max(math.floor(0.5 * (1.0 - top) * count - 0.5), 0)
-        high = min(math.ceil(0.5 * (1.0 - bottom) * count - 0.5), count - 1)
-        for j in range(first + low, first + high + 1):
-            h = (1.0 - (ux * centres[j, 0] + uy * centres[j, 1] + uz * centres[j, 2])) / extent
-            if h < 1.0:
-                if at < room:
-                    index[at] = j
-                    value[at] = wendland_gaussian(h)
-                at += 1
-    return at
+def _cell_of(x, y, z, edge):
+    """Return the cell of a cube map, `edge` cells along each edge, that a direction lies in."""
+    ax, ay, az = abs(x), abs(y), abs(z)
+    if ax >= ay and ax >= az:
+        face, a, b = (0 if x >= 0.0 else 1), y / ax, z / ax
+    elif ay >= az:
+        face, a, b = (2 if y >= 0.0 else 3), x / ay, z / ay
+    else:
+        face, a, b = (4 if z >= 0.0 else 5), x / az, y / az
+    i = min(int(0.5 * edge * (1.0 + a)), edge - 1)
+    j = min(int(0.5 * edge * (1.0 + b)), edge - 1)
+    return (face * edge + i) * edge + j
 
 
 @njit(cache=True, nogil=True)
-def dictionary_rows(directions, centres, starts, extents):
-    """Return (n + 1,) row starts, (nnz,) atoms, (nnz,) λ: which atoms of the dictionary see which unit direction."""
+def atoms_of_cells(centres, starts, extents, edge):
+    """Return the compressed rows of which atoms may see some direction of each of 6 · edge² cells of a cube map.
+
+    centres: (M, 3) Fibonacci grids, z falling within a level. starts: (levels + 1,) first atom of each level.
+    extents: (levels,) 1 − cos σ. Atoms ascend within a cell.
+    """
+    cells = 6 * edge * edge
+    pointer = np.zeros(cells + 1, np.int64)
+    index = np.empty(0, np.int32)
+    corner = np.empty(3)
+    for write in range(2):
+        if write == 1:
+            index = np.empty(pointer[cells], np.int32)
+        at = 0
+        for cell in range(cells):
+            face, i, j = cell // (edge * edge), cell // edge % edge, cell % edge
+            major = 1.0 if face % 2 == 0 else -1.0
+            axis = face // 2
+            a, b = (i + 0.5) * 2.0 / edge - 1.0, (j + 0.5) * 2.0 / edge - 1.0
+            length = math.sqrt(1.0 + a * a + b * b)
+            corner[axis], corner[1 if axis == 0 else 0], corner[1 if axis == 2 else 2] = major, a, b
+            x, y, z = corner[0] / length, corner[1] / length, corner[2] / length
+            # no direction of the cell lies farther from its middle than this
+            half = math.sqrt(2.0) / edge
+            around = half / max(length - half, 0.2)
+            polar = math.acos(min(max(z, -1.0), 1.0))
+            for level in range(extents.shape[0]):
+                first, count = starts[level], starts[level + 1] - starts[level]
+                support = math.acos(max(1.0 - extents[level], -1.0)) + around
+                least = -2.0 if support >= math.pi else math.cos(support)
+                top = 1.0 if polar <= support else math.cos(polar - support)
+                bottom = -1.0 if polar + support >= math.pi else math.cos(polar + support)
+                low = max(math.floor(0.5 * (1.0 - top) * count - 0.5), 0)
+                high = min(math.ceil(0.5 * (1.0 - bottom) * count - 0.5), count - 1)
+                for k in range(first + low, first + high + 1):
+                    if x * centres[k, 0] + y * centres[k, 1] + z * centres[k, 2] >= least:
+                        if write == 1:
+                            index[at] = k
+                        at += 1
+            pointer[cell + 1] = at
+    return pointer, index
+
+
+@njit(cache=True, nogil=True)
+def dictionary_rows(directions, centres, inverse_extents, edge, cell_pointer, cell_atoms):
+    """Return (n + 1,) row starts, (nnz,) atoms, (nnz,) λ: which atoms of the dictionary see which unit direction.
+
+    inverse_extents: (M,) 1 / (1 − cos σ). edge, cell_pointer, cell_atoms: see `atoms_of_cells`.
+    """
     n = directions.shape[0]
     pointer = np.zeros(n + 1, np.int64)
-    room = 64 * n * max(extents.shape[0], 1)
-    index = np.empty(room, np.int32)
-    value = np.empty(room)
-    at = 0
-    for i in range(n):
-        at = _row_of_dictionary(
-            directions[i, 0], directions[i, 1], directions[i, 2], centres, starts, extents, index, value, at
-        )
-        if at > room:
-            bigger_index = np.empty(2 * at, np.int32)
-            bigger_value = np.empty(2 * at)
-            bigger_index[: pointer[i]] = index[: pointer[i]]
-            bigger_value[: pointer[i]] = value[: pointer[i]]
-            index, value, room = bigger_index, bigger_value, 2 * at
-            at = _row_of_dictionary(
-                directions[i, 0], directions[i, 1], directions[i, 2], centres, starts, extents, index, value, pointer[i]
-            )
-        pointer[i + 1] = at
-    return pointer, index[:at].copy(), value[:at].copy()
+    index = np.empty(0, np.int32)
+    value = np.empty(0)
+    for write in range(2):
+        if write == 1:
+            index = np.empty(pointer[n], np.int32)
+            value = np.empty(pointer[n])
+        at = 0
+        for i in range(n):
+            x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+            cell = _cell_of(x, y, z, edge)
+            for k in range(cell_pointer[cell], cell_pointer[cell + 1]):
+                j = cell_atoms[k]
+                h = (1.0 - (x * centres[j, 0] + y * centres[j, 1] + z * centres[j, 2])) * inverse_extents[j]
+                if h < 1.0:
+                    if write == 1:
+                        index[at] = j
+                        value[at] = wendland_gaussian(h)
+                    at += 1
+            pointer[i + 1] = at
+    return pointer, index, value
 
 
 @njit(cache=True, nogil=True)
@@ -79,91 +115,6 @@ def transposed(pointer, index, value, columns):
             values[fill[j]] = value[k]
             fill[j] += 1
     return starts, rows, values
-
-
-@njit(cache=True, nogil=True)
-def orthogonal_selection(pointer, index, value, scale, target, columns, count, ridge, held):
-    """Choose atoms one by one, each the one that lowers Σ (scale_i · (A w)_i − target_i)² + ridge·|w|² the most.
-
-    Pivoted Cholesky of the normal equations, whose columns are formed only for the atoms chosen. It is held in single
-    precision, which chooses the same atoms in a third of the time; the weights are solved again in double.
-
-    pointer, index, value: rows of A, compressed. scale, target: (n,). count: atoms at most.
-    ridge: in units of the normal matrix's mean diagonal. held: atoms that are chosen before any other, in this order.
-    Returns (k,) atoms in order, (k,) falls of the sum of squares, (k, k) lower triangle L of the chosen atoms' normal
-    matrix and (k,) y with L y = right side, so that the weights of the first m solve L[:m, :m]ᵀ w = y[:m].
-    """
-    starts, rows, values = transposed(pointer, index, value, columns)
-    diagonal = np.zeros(columns)
-    pull = np.zeros(columns)
-    for j in range(columns):
-        for k in range(starts[j], starts[j + 1]):
-            i = rows[k]
-            a = values[k] * scale[i]
-            diagonal[j] += a * a
-            pull[j] += a * target[i]
-    seen = 0
-    total = 0.0
-    for j in range(columns):
-        if diagonal[j] > 0.0:
-            seen += 1
-            total += diagonal[j]
-    count = min(count, seen)
-    floor = ridge * total / max(seen, 1)
-    full = diagonal + floor
-    rest = full.copy()
-    basis = np.zeros((count, columns), np.float32)
-    chosen = np.empty(count, np.int64)
-    gains = np.empty(count)
-    right = np.empty(count)
-    column = np.empty(columns)
-    for step in range(count):
-        best, best_gain = -1, 0.0
-        if step < held.shape[0]:
-            best = held[step]
-            rest[best] = max(rest[best], 1e-6 * full[best])
-            best_gain = pull[best] * pull[best] / rest[best]
-        for j in range(columns if best < 0 else 0):
-            if rest[j] > 1e-3 * full[j] and diagonal[j] > 1e-6 * floor:
-                gain = pull[j] * pull[j] / rest[j]
-                if gain > best_gain:
-                    best, best_gain = j, gain
-        if best < 0:
-            return _finish(chosen, gains, basis, right, step)
-        column[:] = 0.0
-        for k in range(starts[best], starts[best + 1]):
-            i = rows[k]
-            a = values[k] * scale[i] * scale[i]
-            for m in range(pointer[i], pointer[i + 1]):
-                column[index[m]] += a * value[m]
-        column[best] += floor
-        for t in range(step):
-            factor = basis[t, best]
-            line = basis[t]
-            for j in range(columns):
-                column[j] -= factor * line[j]
-        pivot = math.sqrt(rest[best])
-        y = pull[best] / pivot
-        for j in range(columns):
-            entry = column[j] / pivot
-            basis[step, j] = entry
-            rest[j] -= entry * entry
-            pull[j] -= entry * y
-        rest[best] = 0.0
-        pull[best] = 0.0
-        basis[step, best] = pivot
-        chosen[step], gains[step], right[step] = best, best_gain, y
-    return _finish(chosen, gains, basis, right, count)
-
-
-@njit(cache=True, nogil=True)
-def _finish(chosen, gains, basis, right, count):
-    """Return the outcome of a selection of `count` atoms, with its triangle gathered."""
-    triangle = np.zeros((count, count))
-    for a in range(count):
-        for b in range(a + 1):
-            triangle[a, b] = basis[b, chosen[a]]
-    return chosen[:count].copy(), gains[:count].copy(), triangle, right[:count].copy()
 
 
 @njit(cache=True, nogil=True)

@@ -6,14 +6,26 @@ import math
 
 import numpy as np
 import pytest
+from numba import config
 
 from hhsr.kernels import field_rows, lookahead, refinement, selection
+from hhsr.kernels import greedy as greedy_kernels
 from hhsr.kernels.sphere_rbf import wendland_gaussian
 from hhsr.model import CentreGrid
 
 GRID = CentreGrid((12, 40), 2.0)
-LEVELS = np.array([0, 12, 52])
-LEVEL_EXTENTS = GRID.extents[[0, 12]]
+EDGE = 3
+RIDGE = np.full(GRID.size, 1e-3)
+
+
+def rows_of(u: np.ndarray, grid: CentreGrid = GRID) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the compressed rows of a dictionary."""
+    levels = np.concatenate([[0], np.cumsum(grid.sizes)])
+    cells = selection.atoms_of_cells(grid.centres, levels, grid.extents[levels[:-1]].copy(), EDGE)
+    rows: tuple[np.ndarray, np.ndarray, np.ndarray] = selection.dictionary_rows(
+        u, grid.centres, 1.0 / grid.extents, EDGE, *cells
+    )
+    return rows
 
 
 def directions(count: int, seed: int = 0) -> np.ndarray:
@@ -39,7 +51,7 @@ def dense_of(pointer: np.ndarray, index: np.ndarray, value: np.ndarray, columns:
 def test_three_ways_to_the_same_rows() -> None:
     u = directions(25)
     expected = dense_rows(u, GRID.centres, GRID.extents)
-    found = selection.dictionary_rows(u, GRID.centres, LEVELS, LEVEL_EXTENTS)
+    found = rows_of(u)
     np.testing.assert_allclose(dense_of(*found, GRID.size), expected, atol=1e-12)
     found = field_rows.sparse_rows(u, GRID.centres, 1.0 / GRID.extents)
     np.testing.assert_allclose(dense_of(*found, GRID.size), expected, atol=1e-12)
@@ -56,7 +68,7 @@ def test_rows_grow_beyond_the_first_room() -> None:
     u = directions(3)
     wide = CentreGrid((200,), 40.0)  # every support is the whole sphere
     expected = dense_rows(u, wide.centres, wide.extents)
-    found = selection.dictionary_rows(u, wide.centres, np.array([0, 200]), wide.extents[:1])
+    found = rows_of(u, wide)
     assert len(found[2]) > 64 * len(u)
     np.testing.assert_allclose(dense_of(*found, 200), expected, atol=1e-12)
     found = field_rows.sparse_rows(u, wide.centres, 1.0 / wide.extents)
@@ -64,7 +76,7 @@ def test_rows_grow_beyond_the_first_room() -> None:
 
 
 def test_columns_are_the_transposed_rows() -> None:
-    found = selection.dictionary_rows(directions(9), GRID.centres, LEVELS, LEVEL_EXTENTS)
+    found = rows_of(directions(9))
     columns = selection.transposed(*found, GRID.size)
     np.testing.assert_array_equal(dense_of(*columns, 9).T, dense_of(*found, GRID.size))
 
@@ -121,13 +133,15 @@ def greedy(a: np.ndarray, target: np.ndarray, count: int, ridge: float) -> list[
 
 def test_selection_is_the_greedy_one_and_its_weights_solve_the_ridge_problem() -> None:
     rng = np.random.default_rng(4)
-    rows = selection.dictionary_rows(directions(60), GRID.centres, LEVELS, LEVEL_EXTENTS)
+    rows = rows_of(directions(60))
     scale, target = rng.uniform(0.5, 2.0, 60), rng.normal(size=60)
     a = scale[:, None] * dense_of(*rows, GRID.size)
     seen = (a**2).sum(axis=0)
     floor = 1e-2 * seen.sum() / (seen > 0).sum()
     none = np.zeros(0, np.int64)
-    chosen, gains, triangle, right = selection.orthogonal_selection(*rows, scale, target, GRID.size, 6, 1e-2, none)
+    chosen, gains, triangle, right = greedy_kernels.orthogonal_selection(
+        *rows, scale, target, GRID.size, 6, np.full(GRID.size, 1e-2), none
+    )
     assert chosen.tolist() == greedy(a, target, 6, floor)
     gram = a[:, chosen].T @ a[:, chosen] + floor * np.eye(6)
     np.testing.assert_allclose(triangle @ triangle.T, gram, rtol=1e-5, atol=1e-5)
@@ -135,18 +149,57 @@ def test_selection_is_the_greedy_one_and_its_weights_solve_the_ridge_problem() -
     pull = a[:, chosen].T @ target
     assert gains.sum() == pytest.approx(pull @ np.linalg.solve(gram, pull), rel=1e-4)
     held = np.array([chosen[3], chosen[1]])
-    again = selection.orthogonal_selection(*rows, scale, target, GRID.size, 4, 1e-2, held)[0]
+    again = greedy_kernels.orthogonal_selection(*rows, scale, target, GRID.size, 4, 10.0 * RIDGE, held)[0]
     assert again[:2].tolist() == held.tolist()
     assert len(set(again.tolist())) == 4
 
 
-def test_selection_ends_where_nothing_is_left_to_gain() -> None:
-    rows = selection.dictionary_rows(directions(5), GRID.centres, LEVELS, LEVEL_EXTENTS)
+def test_blocks_choose_what_one_by_one_would() -> None:
+    # 80 of 2,012 atoms, several blocks, most atoms not looked at in a block: against the textbook's greedy choice.
+    grid = CentreGrid((12, 400, 1600), 3.0)
+    u = directions(900, 7)
+    rows = rows_of(u, grid)
+    random = np.random.default_rng(8)
+    target = np.cos(u @ random.normal(0.0, 4.0, 3)) + 0.3 * np.cos(u @ random.normal(0.0, 9.0, 3))
+    a = dense_of(*rows, grid.size)
+    ridge = np.full(grid.size, 1e-5)
+    count = 20 if config.DISABLE_JIT else 80
     none = np.zeros(0, np.int64)
-    nothing = selection.orthogonal_selection(*rows, np.ones(5), np.zeros(5), GRID.size, 10, 1e-3, none)
+    chosen, gains, triangle, right = greedy_kernels.orthogonal_selection(
+        *rows, np.ones(900), target, grid.size, count, ridge, none
+    )
+    floor = 1e-5 * (a**2).sum(axis=0)[(a**2).sum(axis=0) > 0].mean()
+    slow: list[int] = []
+    lifted = np.vstack([a, math.sqrt(floor) * np.eye(grid.size)])
+    rest, left = lifted.copy(), np.concatenate([target, np.zeros(grid.size)])
+    fall = []
+    for _ in range(count):
+        size = (rest**2).sum(axis=0)
+        gain = np.where(size > 1e-3 * (lifted**2).sum(axis=0), (rest.T @ left) ** 2 / np.maximum(size, 1e-300), 0.0)
+        j = int(gain.argmax())
+        slow.append(j)
+        fall.append(gain[j])
+        axis = rest[:, j] / math.sqrt(size[j])
+        rest = rest - np.outer(axis, axis @ rest)
+        left = left - axis * (axis @ left)
+    assert len(chosen) == count
+    assert gains.sum() == pytest.approx(sum(fall), rel=1e-3)
+    assert chosen[:16].tolist() == slow[:16]
+    np.testing.assert_allclose(triangle @ triangle.T, a[:, chosen].T @ a[:, chosen] + floor * np.eye(count), atol=1e-4)
+    np.testing.assert_allclose(triangle @ right, a[:, chosen].T @ target, atol=1e-3)
+
+
+def test_selection_ends_where_nothing_is_left_to_gain() -> None:
+    rows = rows_of(directions(5))
+    none = np.zeros(0, np.int64)
+    nothing = greedy_kernels.orthogonal_selection(
+        *rows, np.ones(5), np.zeros(5), GRID.size, 10, np.full(GRID.size, 1e-3), none
+    )
     assert [len(part) for part in nothing] == [0, 0, 0, 0]
     one = (np.array([0, 1, 2]), np.array([0, 0], np.int32), np.array([1.0, 2.0]))  # two rows see one atom of three
-    chosen, gains, _, right = selection.orthogonal_selection(*one, np.ones(2), np.array([1.0, 2.0]), 3, 3, 0.0, none)
+    chosen, gains, _, right = greedy_kernels.orthogonal_selection(
+        *one, np.ones(2), np.array([1.0, 2.0]), 3, 3, np.zeros(3), none
+    )
     assert chosen.tolist() == [0]
     assert gains[0] == pytest.approx(5.0)
     assert right[0] == pytest.approx(math.sqrt(5.0))
