@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, TypeVar
 
 import numba
 import numpy as np
+from scipy.spatial import cKDTree
 
+from hhsr.fitting.closing import closed
 from hhsr.fitting.lookahead import Piece
 from hhsr.fitting.refine import Misses, figures, improved, mending_rows
 from hhsr.fitting.rows import Rows
 from hhsr.fitting.scale_field import NONE, costs_of_dropping, fit_ellipsoid, grid_for, leaf_of, select_centres
+from hhsr.fitting.section import Section, section_of
 from hhsr.fitting.solid import Solid
 from hhsr.fitting.spend import counts_within
 from hhsr.fitting.task import Task, hint_rows, hold_rows, start_rows, task_of
@@ -25,15 +28,20 @@ FINEST = (60, 8_000)
 
 
 class Effort(NamedTuple):
-    """Centres of the finest grid for each number to spend, Gauss-Newton steps in a row, rounds of swaps at most."""
+    """Centres of the finest grid for each number to spend, Gauss-Newton steps in a row, rounds of swaps at most.
+
+    closes: whether voids behind cuts are closed in the end.
+    """
 
     atoms: int
     steps: int
     swaps: int
+    closes: bool
 
 
-SCOUT = Effort(5, 2, 1)
-THOROUGH = Effort(7, 3, 3)
+SCOUT = Effort(5, 2, 1, False)
+THOROUGH = Effort(7, 3, 3, True)
+WORST_SHARE = 0.01
 SWAPPED = 0.3
 POWER = 1.5
 SEED = 5
@@ -42,14 +50,32 @@ SEED = 5
 class Fitted(NamedTuple):
     """Leaves in the order of their pieces, and how they fit.
 
-    mean, largest: miss, mm. unseen: share of the samples that no centre sees. worst: the leaf with the largest miss.
+    mean: miss, mm. largests: of each leaf, mm. unseen: share of the samples that no centre sees.
     """
 
     leaves: list[ModelLeaf]
     mean: float
-    largest: float
+    largests: tuple[float, ...]
     unseen: float
-    worst: int
+
+    @property
+    def largest(self) -> float:
+        """The largest miss, mm."""
+        return max(self.largests)
+
+    @property
+    def score(self) -> float:
+        """What is to be as small as can be: the mean miss, and a hundredth of the largest."""
+        return self.mean + WORST_SHARE * self.largest
+
+
+class Prepared(NamedTuple):
+    """A piece, what its leaf has to tell, where it is cut off, and its ellipsoid's (6,) half axes in mm."""
+
+    piece: Piece
+    task: Task
+    section: Section
+    half_axes: FloatArray
 
 
 class Workshop:
@@ -57,28 +83,22 @@ class Workshop:
 
     def __init__(self, solid: Solid) -> None:
         self.solid = solid
-        self._kept: dict[int, tuple[Piece, Task, FloatArray]] = {}
+        self._kept: dict[int, Prepared] = {}
 
-    def prepare(self, pieces: list[Piece]) -> None:
-        """Look at the pieces that are new."""
+    def prepared(self, pieces: Sequence[Piece]) -> list[Prepared]:
+        """Return the pieces prepared, looking at those that are new."""
         new = [piece for piece in pieces if id(piece) not in self._kept]
         for piece, found in zip(new, in_threads(lambda k: self._look(new[k]), len(new)), strict=True):
-            self._kept[id(piece)] = (piece, *found)
+            self._kept[id(piece)] = found
+        return [self._kept[id(piece)] for piece in pieces]
 
-    def task(self, piece: Piece) -> Task:
-        """Return a prepared piece's task."""
-        return self._kept[id(piece)][1]
-
-    def half_axes(self, piece: Piece) -> FloatArray:
-        """Return the (6,) half axes of a prepared piece's ellipsoid, mm."""
-        return self._kept[id(piece)][2]
-
-    def _look(self, piece: Piece) -> tuple[Task, FloatArray]:
+    def _look(self, piece: Piece) -> Prepared:
         task = task_of(self.solid, piece.region, piece.members, piece.centre, SEED)
-        return task, fit_ellipsoid(start_rows(task, self.solid).joined(hint_rows(task, self.solid)))
+        half_axes = fit_ellipsoid(start_rows(task, self.solid).joined(hint_rows(task, self.solid)))
+        return Prepared(piece, task, section_of(self.solid, piece.region, piece.centre), half_axes)
 
 
-def fit_leaves(workshop: Workshop, pieces: list[Piece], budget: int, effort: Effort) -> Fitted:
+def fit_leaves(workshop: Workshop, pieces: Sequence[Piece], budget: int, effort: Effort) -> Fitted:
     """Return the leaves of the pieces within a budget of numbers.
 
     effort: a scout tells which parting is worth a thorough fit; without a round of swaps it tells the wrong one.
@@ -87,25 +107,30 @@ def fit_leaves(workshop: Workshop, pieces: list[Piece], budget: int, effort: Eff
     if free < 0:
         raise ValueError(f"budget: got {budget} numbers for {len(pieces)} leaves, expected {LEAF_NUMBERS} for each")
     solid = workshop.solid
-    workshop.prepare(pieces)
-    tasks = [workshop.task(piece) for piece in pieces]
+    ready = workshop.prepared(pieces)
+    tasks = [r.task for r in ready]
     grid = grid_for(int(np.clip(effort.atoms * budget / len(pieces), *FINEST)))
     none = ScaleField(grid, NONE, frozen([]))
-    bare = [leaf_of(p.centre, workshop.half_axes(p), none) for p in pieces]
-    rows = [
-        start_rows(task, solid).joined(hold_rows(task, solid, workshop.half_axes(piece)))
-        for task, piece in zip(tasks, pieces, strict=True)
-    ]
+    bare = [leaf_of(r.piece.centre, r.half_axes, none) for r in ready]
+    rows = [start_rows(r.task, solid).joined(hold_rows(r.task, solid, r.half_axes)) for r in ready]
     limits = [min(int(2.0 * free / len(pieces)) + 1, free)] * len(pieces)
     leaves = _chosen(bare, rows, [NONE] * len(pieces), limits, free)
-    best, found = _refined(solid, tasks, leaves, effort.steps)
+    best, found = _refined(solid, ready, leaves, effort.steps)
     for _ in range(effort.swaps):
         tried = _swapped(tasks, best.leaves, found, free)
-        swapped, after = _refined(solid, tasks, tried, effort.steps)
+        swapped, after = _refined(solid, ready, tried, effort.steps)
         if swapped.mean >= best.mean:
             break
         best, found = swapped, after
-    return best
+    return _closed(solid, ready, best) if effort.closes else best
+
+
+def _closed(solid: Solid, ready: list[Prepared], fitted: Fitted) -> Fitted:
+    """Return the leaves with their voids closed, where that does not cost more than it brings."""
+    leaves = in_threads(
+        lambda k: closed(solid, ready[k].task, ready[k].section, fitted.leaves[k], POWER), len(fitted.leaves)
+    )
+    return min(_refined(solid, ready, leaves, 0)[0], fitted, key=lambda f: f.score)
 
 
 def _swapped(tasks: list[Task], leaves: list[ModelLeaf], found: list[Misses], free: int) -> list[ModelLeaf]:
@@ -134,17 +159,19 @@ def _chosen(
     ]
 
 
-def _refined(solid: Solid, tasks: list[Task], leaves: list[ModelLeaf], steps: int) -> tuple[Fitted, list[Misses]]:
+def _refined(solid: Solid, ready: list[Prepared], leaves: list[ModelLeaf], steps: int) -> tuple[Fitted, list[Misses]]:
     """Return the leaves after some Gauss-Newton steps each, with what they miss."""
-    done = in_threads(lambda k: improved(solid, tasks[k], leaves[k], steps, POWER), len(leaves))
-    found = [figures(task, leaf, misses) for task, (leaf, misses) in zip(tasks, done, strict=True)]
+    done = in_threads(lambda k: improved(solid, ready[k].task, leaves[k], steps, POWER), len(leaves))
+    found = [figures(solid, r.task, r.section, leaf, misses) for r, (leaf, misses) in zip(ready, done, strict=True)]
+    surface = cKDTree(np.concatenate([f.surface for f in found]))
     count = solid.samples.points.shape[0]
+    unseen = [r.task.points[~r.task.seen] for r in ready]
+    hidden = [surface.query(points)[0] if len(points) else np.zeros(0) for points in unseen]
     fitted = Fitted(
         [leaf for leaf, _ in done],
-        sum(f.total for f in found) / count,
-        max(f.largest for f in found),
-        sum(f.unseen for f in found) / count,
-        int(np.argmax([f.largest for f in found])),
+        (sum(f.total for f in found) + 0.5 * sum(float(h.sum()) for h in hidden)) / count,
+        tuple(max(f.largest, float(h.max(initial=0.0))) for f, h in zip(found, hidden, strict=True)),
+        sum(len(points) for points in unseen) / count,
     )
     return fitted, [misses for _, misses in done]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -59,6 +58,39 @@ class Step:
     split: Split
 
 
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Planes that part a solid, and its pieces.
+
+    planes: (angles (2,), offset) of each, as stored. children: (k, 2) planes, or −1 − piece, below and above each.
+    """
+
+    planes: tuple[tuple[FloatArray, float], ...]
+    children: IntArray
+    pieces: tuple[Piece, ...]
+
+    def split(self, piece: int, split: Split) -> Layout:
+        """Return the layout with one piece cut: its left stays number `piece`, its right comes last."""
+        children = np.where(self.children == -1 - piece, len(self.planes), self.children)
+        pieces = (*self.pieces[:piece], split.left, *self.pieces[piece + 1 :], split.right)
+        return Layout(
+            (*self.planes, (split.angles, split.offset)),
+            np.vstack([children, [-1 - piece, -1 - len(self.pieces)]]).astype(np.int64),
+            pieces,
+        )
+
+    def tree(self, leaves: Sequence[Node]) -> Node:
+        """Return the tree with these leaves, one a piece."""
+
+        def node(at: int) -> Node:
+            if at < 0:
+                return leaves[-1 - at]
+            angles, offset = self.planes[at]
+            return Cut(angles, offset, 0.0, (), *(node(int(child)) for child in self.children[at]))
+
+        return node(0 if self.planes else -1)
+
+
 class Parting:
     """A solid cut into ever more pieces, each cut the one that lowers the misfit the most; made as it is asked for."""
 
@@ -90,27 +122,12 @@ class Parting:
         unseen = sum(piece.hidden for piece in self._pieces[count - 1])
         return unseen / len(self._solid.samples.points)
 
-    def tree(self, leaves: Sequence[Node]) -> Node:
-        """Return the tree of as many pieces as there are leaves, given in the order of `pieces`."""
-        slots: list[Node] = list(leaves)
-        for step in reversed(self._steps[: len(leaves) - 1]):
-            right = slots.pop()
-            slots[step.piece] = Cut(step.split.angles, step.split.offset, 0.0, (), slots[step.piece], right)
-        return slots[0]
-
-    def with_cut(self, count: int, piece: int) -> Parting | None:
-        """Return the parting of `count` pieces with one more cut, through one piece and for its largest misses.
-
-        None where that piece cannot be cut.
-        """
-        split = best_split(self._solid, self.pieces(count)[piece], WORST_POWER)
-        if split is None:
-            return None
-        other = copy(self)
-        other._pieces, other._steps = self._pieces[:count], self._steps[: count - 1]
-        other._take(piece, split)
-        other._offers = [None] * (count + 1)
-        return other
+    def layout(self, count: int) -> Layout:
+        """Return the layout of `count` pieces."""
+        layout = Layout((), np.zeros((0, 2), np.int64), tuple(self._pieces[0]))
+        for step in self._steps[: count - 1]:
+            layout = layout.split(step.piece, step.split)
+        return layout
 
     def _take(self, at: int, split: Split) -> None:
         """Note a cut."""
@@ -193,7 +210,7 @@ def best_split(solid: Solid, piece: Piece, power: float) -> Split | None:
     angle = 0.25
     for _ in range(3):
         shifts = offset + 0.5 * angle * spread * np.linspace(-0.5, 0.5, 5)
-        turned = view.best_plane(_around(normal, angle), shifts, normal)
+        turned = view.best_plane(around(normal, angle), shifts, normal)
         if turned[2] < value:
             normal, offset, value = turned
         angle *= 0.5
@@ -256,7 +273,7 @@ def normal_of(angles: FloatArray) -> FloatArray:
     return np.asarray(Cut(angles, 0.0, 0.0, (), _NOTHING, _NOTHING).normal)
 
 
-def _around(normal: FloatArray, angle: float) -> FloatArray:
+def around(normal: FloatArray, angle: float) -> FloatArray:
     """Return (9, 3): a direction and eight tilted by an angle (rad)."""
     side = np.cross(normal, np.eye(3)[int(np.abs(normal).argmin())])
     side /= np.sqrt((side**2).sum())

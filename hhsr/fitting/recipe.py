@@ -8,8 +8,9 @@ import numpy as np
 
 from hhsr.errors import FitError
 from hhsr.fitting.leaves import LEAF_NUMBERS, SCOUT, THOROUGH, Effort, Fitted, Workshop, fit_leaves
-from hhsr.fitting.lookahead import Parting
+from hhsr.fitting.lookahead import WORST_POWER, Layout, Parting, best_split
 from hhsr.fitting.options import FitOptions
+from hhsr.fitting.planes import settled
 from hhsr.fitting.quantise import quantised
 from hhsr.fitting.solid import solid_of
 from hhsr.model import FloatArray, IntArray, Node
@@ -23,21 +24,26 @@ SAMPLES = (6_000, 40_000)
 NUMBERS_A_PIECE = 16
 MOST_PIECES = 32
 PATIENCE = 3
-WORST_SHARE = 0.01
 HIDDEN = 0.03
 SPIKE = 10.0
+MENDED = 2
 
 
 class Choice(NamedTuple):
-    """A fitted parting: how many pieces, its leaves, its mean and largest miss (mm) and the two in one number."""
+    """A layout of planes, and the leaves fitted to its pieces."""
 
-    pieces: int
+    layout: Layout
     fitted: Fitted
 
     @property
+    def pieces(self) -> int:
+        """How many there are."""
+        return len(self.layout.pieces)
+
+    @property
     def score(self) -> float:
-        """What is to be as small as can be: the mean miss, and a hundredth of the largest."""
-        return self.fitted.mean + WORST_SHARE * self.fitted.largest
+        """What is to be as small as can be."""
+        return self.fitted.score
 
 
 def fit_default(vertices: FloatArray, faces: IntArray, options: FitOptions) -> Node:
@@ -79,23 +85,23 @@ def _spent(workshop: Workshop, parting: Parting, budget: int) -> tuple[Node, Fit
             f"max_parameters: got {budget}, expected at least {POSE_NUMBERS + LEAF_NUMBERS}: a pose and one ellipsoid"
         )
     scouts = _scouts(workshop, parting, budget)
-    best = min(scouts, key=lambda choice: choice.score)
-    parting, best = _mended(workshop, parting, best, budget)
-    fitted = _fit(workshop, parting, best.pieces, budget, THOROUGH)
-    return parting.tree(fitted.leaves), fitted
+    best = _mended(workshop, min(scouts, key=lambda choice: choice.score), budget)
+    fitted = _fit(workshop, best.layout, budget, THOROUGH)
+    return best.layout.tree(fitted.leaves), fitted
 
 
-def _mended(workshop: Workshop, parting: Parting, best: Choice, budget: int) -> tuple[Parting, Choice]:
-    """Return the parting with cuts through the pieces of the largest misses, as long as that pays."""
+def _mended(workshop: Workshop, best: Choice, budget: int) -> Choice:
+    """Return the layout with cuts through the pieces of the largest misses, as long as that pays."""
     while best.fitted.largest > SPIKE * best.fitted.mean and best.pieces < budget // NUMBERS_A_PIECE:
-        cut = parting.with_cut(best.pieces, best.fitted.worst)
-        if cut is None:
+        order = np.argsort(best.fitted.largests)[::-1][:MENDED]
+        splits = [(int(k), best_split(workshop.solid, best.layout.pieces[k], WORST_POWER)) for k in order]
+        layouts = [best.layout.split(k, split) for k, split in splits if split is not None]
+        tried = [Choice(layout, _fit(workshop, layout, budget, SCOUT)) for layout in layouts]
+        paying = [choice for choice in tried if choice.score < best.score]
+        if not paying:
             break
-        tried = Choice(best.pieces + 1, _fit(workshop, cut, best.pieces + 1, budget, SCOUT))
-        if tried.score >= best.score:
-            break
-        parting, best = cut, tried
-    return parting, best
+        best = min(paying, key=lambda choice: choice.score)
+    return best
 
 
 def _scouts(workshop: Workshop, parting: Parting, budget: int) -> list[Choice]:
@@ -107,7 +113,8 @@ def _scouts(workshop: Workshop, parting: Parting, budget: int) -> list[Choice]:
             break
         if count < most and _hopeless(parting, count):
             continue
-        found.append(Choice(count, _fit(workshop, parting, count, budget, SCOUT)))
+        layout = settled(workshop.solid, parting.layout(count))
+        found.append(Choice(layout, _fit(workshop, layout, budget, SCOUT)))
         best = min(found, key=lambda choice: choice.score)
         last = found[-1]
         if last.pieces - best.pieces >= PATIENCE or last.score > 1.5 * best.score:
@@ -126,7 +133,7 @@ def _hopeless(parting: Parting, count: int) -> bool:
     )
 
 
-def _fit(workshop: Workshop, parting: Parting, pieces: int, budget: int, effort: Effort) -> Fitted:
-    """Return the fitted leaves of so many pieces."""
-    numbers = budget - POSE_NUMBERS - CUT_NUMBERS * (pieces - 1)
-    return fit_leaves(workshop, parting.pieces(pieces), numbers, effort)
+def _fit(workshop: Workshop, layout: Layout, budget: int, effort: Effort) -> Fitted:
+    """Return the fitted leaves of a layout's pieces."""
+    numbers = budget - POSE_NUMBERS - CUT_NUMBERS * len(layout.planes)
+    return fit_leaves(workshop, layout.pieces, numbers, effort)

@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hhsr.fitting.rows import GRAZING, BoolArray, Rows
+from hhsr.fitting.rows import GRAZING, Rows
 from hhsr.fitting.scale_field import ellipsoid_radii, leaf_of, ridge_of
+from hhsr.fitting.section import Section
 from hhsr.fitting.solid import Solid
-from hhsr.fitting.task import BOUND_RAYS, HOLD, RAYS, Task, polar, ray_share
+from hhsr.fitting.task import BOUND_RAYS, HOLD, RAYS, Task, ray_share
 from hhsr.kernels.refinement import chosen_rows, field_values, normal_equations
 from hhsr.kernels.selection import solve_normal
 from hhsr.model import MAX_SCALE, FloatArray, IntArray, ModelLeaf, ScaleField
@@ -36,23 +37,26 @@ class Misses(NamedTuple):
 
     radius: (n,) mm of the leaf. miss: (n,) signed, mm. slope: (n,) of the miss by ρ. share: (n,) ≥ 0, of how many
     samples a row stands for; 0: it tells nothing. near: rows before this one are distances to the source, the others
-    say by how much the leaf falls short of a bound (or how far it strays from its base: slack).
+    say by how much the leaf falls short of a bound, or how far it strays from its base.
     """
 
     radius: FloatArray
     miss: FloatArray
     slope: FloatArray
     share: FloatArray
-    slack: BoolArray
     near: int
 
 
 class Figures(NamedTuple):
-    """Sum of what a leaf misses, mm · samples, half of either way; the largest miss, mm; how many samples it hides."""
+    """How a leaf fits, but for samples that its centre does not see.
+
+    total: sum of its misses, mm · samples, half of either way. largest: mm. surface: (n, 3) points of its own surface,
+    and of its planes where it leaves voids.
+    """
 
     total: float
     largest: float
-    unseen: int
+    surface: FloatArray
 
 
 def view_of(task: Task, field: ScaleField) -> View:
@@ -89,15 +93,18 @@ def mending_rows(task: Task, found: Misses) -> Rows:
     return Rows(task.directions[kept], wanted[kept], weights[kept], np.zeros(int(kept.sum()), dtype=bool))
 
 
-def figures(task: Task, leaf: ModelLeaf, found: Misses) -> Figures:
-    """Return how a leaf fits; samples that its centre does not see count by their distance along the ray."""
-    r, along = polar(task.points[~task.seen], leaf.centre)
-    hidden = np.abs(radii_of(leaf, along) - r)
-    share = np.where(found.slack, 0.0, found.share)
-    miss = np.abs(found.miss)
-    total = 0.5 * (float((miss * share).sum()) + float(hidden.sum()))
-    largest = max(float(miss[share > 0.0].max(initial=0.0)), float(hidden.max(initial=0.0)))
-    return Figures(total, largest, r.size)
+def figures(solid: Solid, task: Task, section: Section, leaf: ModelLeaf, found: Misses) -> Figures:
+    """Return how a leaf fits, voids behind cuts by their depth."""
+    told = found.share[: found.near] > 0.0
+    miss = np.abs(found.miss[: found.near])[told]
+    void = radii_of(leaf, section.along) < section.reach
+    lost = float(section.depth[void].sum()) * section.cell / solid.sample_area
+    total = 0.5 * (float((miss * found.share[: found.near][told]).sum()) + lost)
+    own = np.arange(task.along.shape[0], found.near)[told[task.along.shape[0] :]]
+    surface = leaf.centre + np.concatenate(
+        [found.radius[own, None] * task.directions[own], section.reach[void, None] * section.along[void]]
+    )
+    return Figures(total, max(float(a.max(initial=0.0)) for a in (miss, section.depth[void])), surface)
 
 
 def radii_of(leaf: ModelLeaf, directions: FloatArray) -> FloatArray:
@@ -126,9 +133,7 @@ def misses(task: Task, solid: Solid, leaf: ModelLeaf, view: View) -> Misses:
     short = radius[second:] < task.bound
     miss[second:] = radius[second:] - np.where(short, task.bound, np.maximum(base[second:], task.bound))
     share[second:] = ray_share(solid, BOUND_RAYS) * (task.bound * np.where(short, task.urgency, HOLD)) ** 2
-    slack = np.zeros(radius.size, dtype=bool)
-    slack[second:] = ~short
-    return Misses(radius, miss, slope, share, slack, second)
+    return Misses(radius, miss, slope, share, second)
 
 
 def weights_of(found: Misses, solid: Solid, power: float) -> FloatArray:

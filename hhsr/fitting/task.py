@@ -29,7 +29,7 @@ class Task(NamedTuple):
     along, radii, cosine: (s, 3), (s,) mm, (s,) of those that it sees: direction, distance, cosine with the normal.
     free: (r, 3) rays that meet the source within the region.
     behind: (b, 3) rays that leave the region inside the solid: there the leaf is cut off, and has to reach the plane.
-    bound: (b,) mm that ρ has to be at least: the plane and some slack.
+    bound, slack: (b,) mm that ρ has to be at least: the plane and some slack; (b,) mm, that slack.
     urgency: (b,) by how much a miss counts more: falling short by a hair opens a void as deep as the solid is there.
     hint: (b,) mm, where the ray leaves the solid beyond the plane, at most half as far again.
     directions: (s + r + b, 3) along, free and behind together.
@@ -45,6 +45,7 @@ class Task(NamedTuple):
     free: FloatArray
     behind: FloatArray
     bound: FloatArray
+    slack: FloatArray
     urgency: FloatArray
     hint: FloatArray
     directions: FloatArray
@@ -76,6 +77,7 @@ def task_of(solid: Solid, region: Region, members: IntArray, centre: FloatArray,
         free,
         behind,
         reach + slack,
+        slack,
         urgency * np.sqrt(np.maximum(cosine, GRAZING)),
         np.minimum(hit, FARTHEST_HINT * reach),
         np.concatenate([along, free, behind]),

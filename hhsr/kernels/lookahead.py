@@ -12,6 +12,38 @@ GRAZING = 0.2
 
 
 @njit(cache=True, nogil=True)
+def add_member(x, y, z, normals, i, sums):
+    """Add sample i, at (x, y, z) from a centre that sees it, to the sums of its cell of directions."""
+    r = math.sqrt(x * x + y * y + z * z) + 1e-12
+    cosine = (x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]) / r
+    w = max(abs(cosine), GRAZING)
+    ax, ay, az = abs(x), abs(y), abs(z)
+    if ax >= ay and ax >= az:
+        face, a, b = (0 if x >= 0.0 else 1), y / ax, z / ax
+    elif ay >= az:
+        face, a, b = (2 if y >= 0.0 else 3), x / ay, z / ay
+    else:
+        face, a, b = (4 if z >= 0.0 else 5), x / az, y / az
+    # cells of nearly equal solid angle: the warp's slope is 4/3 at a face's middle, 2/3 at its edge
+    a = 0.5 * CELLS_PER_EDGE * (1.0 + a * (4.0 - abs(a)) / 3.0)
+    b = 0.5 * CELLS_PER_EDGE * (1.0 + b * (4.0 - abs(b)) / 3.0)
+    ia, ib = min(int(a), CELLS_PER_EDGE - 1), min(int(b), CELLS_PER_EDGE - 1)
+    s = sums[(face * CELLS_PER_EDGE + ia) * CELLS_PER_EDGE + ib]
+    a -= ia + 0.5
+    b -= ib + 0.5
+    s[0] += w
+    s[1] += w * a
+    s[2] += w * b
+    s[3] += w * a * a
+    s[4] += w * a * b
+    s[5] += w * b * b
+    s[6] += w * r
+    s[7] += w * a * r
+    s[8] += w * b * r
+    s[9] += w * r * r
+
+
+@njit(cache=True, nogil=True)
 def _accumulate(points, normals, order, gaps, heights, plane_offset, side, cx, cy, cz, sums):
     """Add the members of one side of a plane that a centre sees to the sums of their cells of directions.
 
@@ -25,41 +57,13 @@ def _accumulate(points, normals, order, gaps, heights, plane_offset, side, cx, c
             continue
         if gaps[at] > 0.0:
             hidden += gaps[at]
-            continue
-        x, y, z = points[i, 0] - cx, points[i, 1] - cy, points[i, 2] - cz
-        r = math.sqrt(x * x + y * y + z * z) + 1e-12
-        cosine = (x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]) / r
-        w = max(abs(cosine), GRAZING)
-        ax, ay, az = abs(x), abs(y), abs(z)
-        if ax >= ay and ax >= az:
-            face, a, b = (0 if x >= 0.0 else 1), y / ax, z / ax
-        elif ay >= az:
-            face, a, b = (2 if y >= 0.0 else 3), x / ay, z / ay
         else:
-            face, a, b = (4 if z >= 0.0 else 5), x / az, y / az
-        # cells of nearly equal solid angle: the warp's slope is 4/3 at a face's middle, 2/3 at its edge
-        a = 0.5 * CELLS_PER_EDGE * (1.0 + a * (4.0 - abs(a)) / 3.0)
-        b = 0.5 * CELLS_PER_EDGE * (1.0 + b * (4.0 - abs(b)) / 3.0)
-        ia, ib = min(int(a), CELLS_PER_EDGE - 1), min(int(b), CELLS_PER_EDGE - 1)
-        cell = (face * CELLS_PER_EDGE + ia) * CELLS_PER_EDGE + ib
-        a -= ia + 0.5
-        b -= ib + 0.5
-        s = sums[cell]
-        s[0] += w
-        s[1] += w * a
-        s[2] += w * b
-        s[3] += w * a * a
-        s[4] += w * a * b
-        s[5] += w * b * b
-        s[6] += w * r
-        s[7] += w * a * r
-        s[8] += w * b * r
-        s[9] += w * r * r
+            add_member(points[i, 0] - cx, points[i, 1] - cy, points[i, 2] - cz, normals, i, sums)
     return hidden
 
 
 @njit(cache=True, nogil=True)
-def _misfit_of_cells(sums, power):
+def misfit_of_cells(sums, power):
     """Return Σ over cells W (SSE / W)^(power/2): what a plane per cell leaves of the radii, in mm^power · samples."""
     total = 0.0
     for cell in range(CELLS):
@@ -115,7 +119,7 @@ def best_centres(points, normals, order, gaps, heights, offsets, candidates, can
                     candidates[c, 2],
                     sums,
                 )
-                value = hidden + _misfit_of_cells(sums, power)
+                value = hidden + misfit_of_cells(sums, power)
                 if value < misfit[d, k, s]:
                     misfit[d, k, s] = value
                     which[d, k, s] = c
@@ -131,5 +135,5 @@ def misfits(points, normals, order, gaps, candidates, power):
         sums = np.zeros((CELLS, SUMS))
         x, y, z = candidates[c, 0], candidates[c, 1], candidates[c, 2]
         hidden = _accumulate(points, normals, order, gaps[c], heights, 0.0, 0, x, y, z, sums)
-        out[c] = hidden + _misfit_of_cells(sums, power)
+        out[c] = hidden + misfit_of_cells(sums, power)
     return out
