@@ -28,19 +28,15 @@ FINEST = (60, 8_000)
 
 
 class Effort(NamedTuple):
-    """Centres of the finest grid for each number to spend, Gauss-Newton steps in a row, rounds of swaps at most.
-
-    closes: whether voids behind cuts are closed in the end.
-    """
+    """Centres of the finest grid for each number to spend, Gauss-Newton steps in a row, rounds of swaps at most."""
 
     atoms: int
     steps: int
     swaps: int
-    closes: bool
 
 
-SCOUT = Effort(5, 2, 1, False)
-THOROUGH = Effort(7, 3, 3, True)
+SCOUT = Effort(5, 2, 1)
+THOROUGH = Effort(7, 3, 3)
 WORST_SHARE = 0.01
 SWAPPED = 0.3
 POWER = 1.5
@@ -122,7 +118,7 @@ def fit_leaves(workshop: Workshop, pieces: Sequence[Piece], budget: int, effort:
         if swapped.mean >= best.mean:
             break
         best, found = swapped, after
-    return _closed(solid, ready, best) if effort.closes else best
+    return _closed(solid, ready, best)
 
 
 def _closed(solid: Solid, ready: list[Prepared], fitted: Fitted) -> Fitted:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hhsr.fitting.lookahead import LEAST_SHARE, Layout, Piece, around, best_centre, hidden, normal_of
+from hhsr.fitting.lookahead import LEAST_SHARE, Layout, Piece, around, best_centre, hidden_costs, normal_of
 from hhsr.fitting.quantise import rounded_plane
 from hhsr.fitting.solid import Region, Solid, everywhere
 from hhsr.kernels.plane_moves import leaves_of, misfits_of_places
@@ -41,7 +41,7 @@ def _moved_planes(solid: Solid, layout: Layout, power: float) -> list[tuple[Floa
     few = np.arange(0, solid.samples.points.shape[0], max(solid.samples.points.shape[0] // SAMPLES, 1))
     points, slopes = solid.samples.points[few], solid.samples.normals[few]
     centres = np.array([piece.centre for piece in layout.pieces])
-    gaps = hidden(solid, centres, few) ** power
+    gaps = hidden_costs(solid, centres, few, power)
     least = LEAST_SHARE * few.size
     planes = list(layout.planes)
     normals = np.array([normal_of(angles) for angles, _ in planes])

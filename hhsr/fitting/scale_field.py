@@ -18,7 +18,7 @@ from hhsr.model import CentreGrid, FloatArray, IntArray, ModelLeaf, ScaleField, 
 RATIO = 1.5
 SUPPORT = 3.3
 COARSEST = 20
-RIDGE = 1e-5
+RIDGE = 4e-5
 CELL_EDGE = 16
 NO_ROTATION = np.zeros(0)
 NONE = np.zeros(0, np.int64)
@@ -71,8 +71,13 @@ def _atoms_of_cells(grid: CentreGrid) -> tuple[IntArray, IntArray]:
 
 
 def ridge_of(extents: FloatArray) -> FloatArray:
-    """Return the ridge of centres by their extents, in units of the normal matrix's mean diagonal."""
-    return np.full(extents.size, RIDGE)
+    """Return the ridge of centres by their extents, in units of the normal matrix's mean diagonal.
+
+    Narrow centres pay more: they are steep, and swing where samples are thin (liver B: Σ|w|/σ² 1569 → 900 at the same
+    mean; a tenth of that where all pay alike).
+    """
+    ridge: FloatArray = RIDGE / extents
+    return ridge
 
 
 def ellipsoid_radii(half_axes: FloatArray, directions: FloatArray) -> FloatArray:
