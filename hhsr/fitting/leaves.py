@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hhsr.fitting.closing import closed
+from hhsr.fitting.closing import WORST_SHARE, closed
 from hhsr.fitting.lookahead import Piece
 from hhsr.fitting.refine import Misses, figures, improved, mending_rows
 from hhsr.fitting.rows import Rows
@@ -37,7 +37,6 @@ class Effort(NamedTuple):
 
 SCOUT = Effort(5, 2, 1)
 THOROUGH = Effort(7, 3, 3)
-WORST_SHARE = 0.01
 SWAPPED = 0.3
 POWER = 1.5
 SEED = 5
@@ -122,11 +121,11 @@ def fit_leaves(workshop: Workshop, pieces: Sequence[Piece], budget: int, effort:
 
 
 def _closed(solid: Solid, ready: list[Prepared], fitted: Fitted) -> Fitted:
-    """Return the leaves with their voids closed, where that does not cost more than it brings."""
-    leaves = in_threads(
+    """Return the leaves with their voids behind cuts closed, where that does not cost more than it brings."""
+    done = in_threads(
         lambda k: closed(solid, ready[k].task, ready[k].section, fitted.leaves[k], POWER), len(fitted.leaves)
     )
-    return min(_refined(solid, ready, leaves, 0)[0], fitted, key=lambda f: f.score)
+    return _judged(solid, ready, done)
 
 
 def _swapped(tasks: list[Task], leaves: list[ModelLeaf], found: list[Misses], free: int) -> list[ModelLeaf]:
@@ -158,18 +157,22 @@ def _chosen(
 def _refined(solid: Solid, ready: list[Prepared], leaves: list[ModelLeaf], steps: int) -> tuple[Fitted, list[Misses]]:
     """Return the leaves after some Gauss-Newton steps each, with what they miss."""
     done = in_threads(lambda k: improved(solid, ready[k].task, leaves[k], steps, POWER), len(leaves))
+    return _judged(solid, ready, done), [misses for _, misses in done]
+
+
+def _judged(solid: Solid, ready: list[Prepared], done: list[tuple[ModelLeaf, Misses]]) -> Fitted:
+    """Return the leaves with what they miss."""
     found = [figures(solid, r.task, r.section, leaf, misses) for r, (leaf, misses) in zip(ready, done, strict=True)]
     surface = cKDTree(np.concatenate([f.surface for f in found]))
     count = solid.samples.points.shape[0]
     unseen = [r.task.points[~r.task.seen] for r in ready]
     hidden = [surface.query(points)[0] if len(points) else np.zeros(0) for points in unseen]
-    fitted = Fitted(
+    return Fitted(
         [leaf for leaf, _ in done],
         (sum(f.total for f in found) + 0.5 * sum(float(h.sum()) for h in hidden)) / count,
         tuple(max(f.largest, float(h.max(initial=0.0))) for f, h in zip(found, hidden, strict=True)),
         sum(len(points) for points in unseen) / count,
     )
-    return fitted, [misses for _, misses in done]
 
 
 def in_threads(work: Callable[[int], T], count: int) -> list[T]:

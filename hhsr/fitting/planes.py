@@ -72,11 +72,9 @@ def _places(
     pivot = points[near].mean(axis=0) if near.any() else offset * normal
     pivot = pivot + (offset - pivot @ normal) * normal
     stored = [rounded_plane(normal, offset, solid.size)]
+    shifts = 0.5 * angle * solid.size * SHIFTS
     for direction in around(normal, angle):
-        for shift in SHIFTS:
-            stored.append(
-                rounded_plane(direction, float(direction @ pivot + shift * angle * 0.5 * solid.size), solid.size)
-            )
+        stored += [rounded_plane(direction, float(direction @ pivot + shift), solid.size) for shift in shifts]
     tried = np.array([normal_of(angles) for angles, _ in stored])
     return tried, np.array([height for _, height in stored]), stored
 

@@ -9,6 +9,7 @@ import numpy as np
 from hhsr.errors import FitError
 from hhsr.fitting.leaves import LEAF_NUMBERS, SCOUT, THOROUGH, Effort, Fitted, Workshop, fit_leaves
 from hhsr.fitting.lookahead import WORST_POWER, Layout, Parting, best_split
+from hhsr.fitting.normalise import on_grid, scaled
 from hhsr.fitting.options import FitOptions
 from hhsr.fitting.planes import settled
 from hhsr.fitting.quantise import quantised
@@ -23,7 +24,7 @@ SAMPLES_A_NUMBER = 12
 SAMPLES = (6_000, 40_000)
 NUMBERS_A_PIECE = 16
 MOST_PIECES = 32
-PATIENCE = 3
+PATIENCE = 5
 HIDDEN = 0.03
 SPIKE = 10.0
 MENDED = 2
@@ -59,22 +60,26 @@ def fit_default(vertices: FloatArray, faces: IntArray, options: FitOptions) -> N
     ------
     FitError : the budget cannot hold a pose and one leaf.
     """
+    unit, size = on_grid(vertices, np.unique(faces))
+    return quantised(scaled(_fit_unit(unit, faces, options, size), size))
+
+
+def _fit_unit(vertices: FloatArray, faces: IntArray, options: FitOptions, size_mm: float) -> Node:
+    """Return the tree's root for a surface whose longest side is 1, of a size in mm."""
     expected = options.max_parameters if options.max_parameters is not None else USUAL_NUMBERS
     samples = int(np.clip(SAMPLES_A_NUMBER * expected, *SAMPLES))
     solid = solid_of(vertices, faces, samples, options.seed)
     parting, workshop = Parting(solid), Workshop(solid)
-    if options.max_mean_error_mm is None and options.max_error_mm is None:
-        budget = options.max_parameters if options.max_parameters is not None else USUAL_NUMBERS
-        return quantised(_spent(workshop, parting, budget)[0])
+    goals = options.max_mean_error_mm, options.max_error_mm
+    mean, largest = (goal / size_mm if goal is not None else np.inf for goal in goals)
+    if goals == (None, None):
+        return _spent(workshop, parting, expected)[0]
     most = options.max_parameters if options.max_parameters is not None else MOST_NUMBERS
     budget = min(64, most)
     while True:
         node, fitted = _spent(workshop, parting, budget)
-        met = (options.max_mean_error_mm is None or fitted.mean <= options.max_mean_error_mm) and (
-            options.max_error_mm is None or fitted.largest <= options.max_error_mm
-        )
-        if met or budget >= most:
-            return quantised(node)
+        if (fitted.mean <= mean and fitted.largest <= largest) or budget >= most:
+            return node
         budget = min(budget + budget // 2, most)
 
 
