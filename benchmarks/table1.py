@@ -47,6 +47,16 @@ def safe_rows_of(job: tuple[Path, str]) -> tuple[str, list[Row], str]:
         return job[0].stem, [], str(error)
 
 
+def print_shapes(found: Sequence[tuple[str, list[Row]]]) -> None:
+    """Print mean and largest error (mm) of every organ by every method."""
+    columns = list(dict.fromkeys((row.method, row.budget) for _, rows in found for row in rows))
+    print("\n| organ | " + " | ".join(f"{method} {budget}" for method, budget in columns) + " |")
+    print("|---" * (len(columns) + 1) + "|")
+    for name, rows in found:
+        known = {(row.method, row.budget): f"{row.mean_mm:.3f}, {row.max_mm:.2f}" for row in rows}
+        print(f"| {name} | " + " | ".join(known.get(column, "–") for column in columns) + " |")
+
+
 def print_table(kind: str, rows: Sequence[Row]) -> None:
     """Print mean ± sd of each method and budget, and the range of stored numbers."""
     print(f"\n| {kind} | numbers | bytes | mean error, mm | worst | largest error, median | seconds |")
@@ -77,12 +87,15 @@ def main() -> int:
             print(f"no {kind} meshes below {words.data}", file=sys.stderr)
             return 2
         rows: list[Row] = []
+        shapes: list[tuple[str, list[Row]]] = []
         with ProcessPoolExecutor(words.jobs, get_context("spawn")) as pool:
             for name, found, problem in pool.map(safe_rows_of, [(file, kind) for file in files]):
                 print(
                     f"{name}: " + (problem or ", ".join(f"{r.method} {r.mean_mm:.3f}" for r in found)), file=sys.stderr
                 )
                 rows += found
+                shapes.append((name, found))
+        print_shapes(shapes)
         print_table(kind, rows)
     return 0
 

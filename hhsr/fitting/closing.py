@@ -43,12 +43,12 @@ def closed(solid: Solid, task: Task, section: Section, leaf: ModelLeaf, power: f
 def _score(solid: Solid, task: Task, section: Section, leaf: ModelLeaf, found: Misses) -> float:
     """Return what is to be as small as can be, mm: by how much this leaf raises the mean miss, and its largest."""
     own = figures(solid, task, section, leaf, found)
-    return float(own.total / len(solid.samples.points) + WORST_SHARE * own.largest)
+    return float(own.total * task.stride / len(solid.samples.points) + WORST_SHARE * own.largest)
 
 
 def with_section(task: Task, section: Section) -> Task:
     """Return a task with bounds at those points of its sections that it sees."""
-    seen = section.hit > section.reach
+    seen = np.flatnonzero(section.hit > section.reach)[:: task.stride]
     along, reach = section.along[seen], section.reach[seen]
     slack = np.minimum(SLACK_OF_DEPTH * section.depth[seen], SLACK_OF_REACH * reach)
     slack = np.minimum(slack, 0.5 * (section.hit[seen] - reach))

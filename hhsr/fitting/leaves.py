@@ -28,15 +28,19 @@ FINEST = (60, 8_000)
 
 
 class Effort(NamedTuple):
-    """Centres of the finest grid for each number to spend, Gauss-Newton steps in a row, rounds of swaps at most."""
+    """Centres of the finest grid for each number to spend, Gauss-Newton steps in a row, rounds of swaps at most.
+
+    stride: of how many samples and rays one is looked at.
+    """
 
     atoms: int
     steps: int
     swaps: int
+    stride: int
 
 
-SCOUT = Effort(5, 2, 1)
-THOROUGH = Effort(7, 3, 3)
+SCOUT = Effort(5, 2, 1, 2)
+THOROUGH = Effort(7, 3, 3, 1)
 SWAPPED = 0.3
 POWER = 1.5
 SEED = 5
@@ -102,7 +106,7 @@ def fit_leaves(workshop: Workshop, pieces: Sequence[Piece], budget: int, effort:
     if free < 0:
         raise ValueError(f"budget: got {budget} numbers for {len(pieces)} leaves, expected {LEAF_NUMBERS} for each")
     solid = workshop.solid
-    ready = workshop.prepared(pieces)
+    ready = [r._replace(task=r.task.thinned(effort.stride)) for r in workshop.prepared(pieces)]
     tasks = [r.task for r in ready]
     grid = grid_for(int(np.clip(effort.atoms * budget / len(pieces), *FINEST)))
     none = ScaleField(grid, NONE, frozen([]))
@@ -164,7 +168,7 @@ def _judged(solid: Solid, ready: list[Prepared], done: list[tuple[ModelLeaf, Mis
     """Return the leaves with what they miss."""
     found = [figures(solid, r.task, r.section, leaf, misses) for r, (leaf, misses) in zip(ready, done, strict=True)]
     surface = cKDTree(np.concatenate([f.surface for f in found]))
-    count = solid.samples.points.shape[0]
+    count = sum(r.task.seen.size for r in ready)
     unseen = [r.task.points[~r.task.seen] for r in ready]
     hidden = [surface.query(points)[0] if len(points) else np.zeros(0) for points in unseen]
     return Fitted(

@@ -160,30 +160,37 @@ def _fall(piece: Piece, offer: Split | Literal["unknown"] | None) -> float:
     return float(piece.misfit - offer.misfit) if isinstance(offer, Split) else -np.inf
 
 
-def best_centre(solid: Solid, members: IntArray, region: Region, power: float) -> tuple[FloatArray, float, float]:
+def best_centre(
+    solid: Solid, members: IntArray, region: Region, power: float, start: FloatArray | None = None
+) -> tuple[FloatArray, float, float]:
     """Return the point inside the solid and the region from which the members look most like a radius.
 
-    With it the misfit, and how many members it does not see.
-
-    The misfit is the sum over all members, in mm (for power 1), from the few that are looked at.
+    start: look around this point only. With the point come the misfit, and how many members it does not see: sums over
+    all members, in mm (for power 1) and samples, from the few that are looked at.
     """
     inner = np.flatnonzero(region.holds(solid.inner))
     few = members[:: max(members.size // COARSE, 1)].copy()
     if inner.size == 0:
         middle = solid.samples.points[members].mean(axis=0)
         inner = np.array([int(((solid.inner - middle) ** 2).sum(axis=1).argmin())])
-    tried = inner[_spread(solid.inner[inner], solid.depth[inner], CENTRES)]
-    for _ in range(2):
-        gaps = hidden_costs(solid, solid.inner[tried], few, power)
-        values = misfits(solid.samples.points, solid.samples.normals, few, gaps, solid.inner[tried], power)
-        at = int(values.argmin())
-        best, least, unseen = tried[at], float(values[at]), int((gaps[at] > 0.0).sum())
-        near = np.argsort(((solid.inner[inner] - solid.inner[best]) ** 2).sum(axis=1), kind="stable")
-        tried = inner[near[: inner.size // CENTRES + 1 : max(inner.size // CENTRES**2, 1)]][:CENTRES]
-        if best not in tried:
-            tried = np.append(tried, best)
+    if start is None:
+        tried = inner[_spread(solid.inner[inner], solid.depth[inner], CENTRES)]
+        start = solid.inner[tried[int(_seen_from(solid, tried, few, power)[0].argmin())]]
+    near = inner[np.argsort(((solid.inner[inner] - start) ** 2).sum(axis=1), kind="stable")]
+    tried = near[: inner.size // CENTRES + 1 : max(inner.size // CENTRES**2, 1)][:CENTRES]
+    values, unseen = _seen_from(solid, tried, few, power)
+    at = int(values.argmin())
     share = members.size / few.size
-    return solid.inner[best], least * share, unseen * share
+    return solid.inner[tried[at]], float(values[at]) * share, float(unseen[at]) * share
+
+
+def _seen_from(solid: Solid, inner: IntArray, few: IntArray, power: float) -> tuple[FloatArray, FloatArray]:
+    """Return (c,) the misfit of a few members from some inner points, and (c,) how many of them are not seen."""
+    centres = solid.inner[inner]
+    costs = hidden_costs(solid, centres, few, power)
+    samples = solid.samples
+    values: FloatArray = misfits(samples.points, samples.normals, few, costs, centres, power)
+    return values, (costs > 0.0).sum(axis=1).astype(float)
 
 
 def hidden(solid: Solid, centres: FloatArray, members: IntArray) -> FloatArray:

@@ -91,7 +91,8 @@ def _with_pieces(solid: Solid, layout: Layout, planes: list[tuple[FloatArray, fl
         members: IntArray = np.flatnonzero(owner == k)
         if members.size < 8 or not regions[k].holds(solid.inner).any():
             return None
-        pieces.append(Piece(regions[k], members, *best_centre(solid, members, regions[k], power), old.depth))
+        found = best_centre(solid, members, regions[k], power, old.centre)
+        pieces.append(Piece(regions[k], members, *found, old.depth))
     return Layout(tuple(planes), layout.children, tuple(pieces))
 
 

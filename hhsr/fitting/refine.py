@@ -98,7 +98,7 @@ def figures(solid: Solid, task: Task, section: Section, leaf: ModelLeaf, found: 
     told = found.share[: found.near] > 0.0
     miss = np.abs(found.miss[: found.near])[told]
     void = radii_of(leaf, section.along) < section.reach
-    lost = float(section.depth[void].sum()) * section.cell / solid.sample_area
+    lost = float(section.depth[void].sum()) * section.cell / (solid.sample_area * task.stride)
     total = 0.5 * (float((miss * found.share[: found.near][told]).sum()) + lost)
     own = np.arange(task.along.shape[0], found.near)[told[task.along.shape[0] :]]
     surface = leaf.centre + np.concatenate(

@@ -33,6 +33,7 @@ class Task(NamedTuple):
     urgency: (b,) by how much a miss counts more: falling short by a hair opens a void as deep as the solid is there.
     hint: (b,) mm, where the ray leaves the solid beyond the plane, at most half as far again.
     directions: (s + r + b, 3) along, free and behind together.
+    stride: of how many samples and rays one was kept.
     """
 
     region: Region
@@ -49,6 +50,29 @@ class Task(NamedTuple):
     urgency: FloatArray
     hint: FloatArray
     directions: FloatArray
+    stride: int = 1
+
+    def thinned(self, stride: int) -> Task:
+        """Return the task with one of `stride` samples and rays: their shares of each other stay."""
+        seen = np.flatnonzero(self.seen)[::stride]
+        kept = np.sort(np.concatenate([seen, np.flatnonzero(~self.seen)[::stride]]))
+        along, free, behind = self.along[::stride], self.free[::stride], self.behind[::stride]
+        return self._replace(
+            points=self.points[kept],
+            normals=self.normals[kept],
+            seen=self.seen[kept],
+            along=along,
+            radii=self.radii[::stride],
+            cosine=self.cosine[::stride],
+            free=free,
+            behind=behind,
+            bound=self.bound[::stride],
+            slack=self.slack[::stride],
+            urgency=self.urgency[::stride],
+            hint=self.hint[::stride],
+            directions=np.concatenate([along, free, behind]),
+            stride=stride,
+        )
 
 
 def task_of(solid: Solid, region: Region, members: IntArray, centre: FloatArray, seed: int) -> Task:
