@@ -33,6 +33,7 @@ from hhsr.kernels import contains as contains_kernels
 from hhsr.kernels import crossing as crossing_kernels
 from hhsr.kernels import distance as distance_kernels
 from hhsr.kernels import tree as tree_kernels
+from hhsr.local_error import errors_at
 from hhsr.model import ErrorFigures, FloatArray, Provenance, Tree, rotation_matrix
 from hhsr.surface import reconstruct
 
@@ -107,6 +108,13 @@ class Shape:
     def leaf_errors(self) -> tuple[ErrorFigures, ...]:
         """The same for each leaf, left to right."""
         return self.provenance.leaf_errors
+
+    def fit_error_at(self, points: ArrayLike) -> Any:
+        """Return (...) mm, the fit's sampled maximum error near points (..., 3) of its surface: `hhsr.local_error`."""
+        array = as_points(points)
+        require_finite(array, "points")
+        flat = errors_at(self.tree, self.fit_error, self.leaf_errors, self.report, array.reshape(-1, 3))
+        return _scalar(flat.reshape(array.shape[:-1]))
 
     @property
     def bounds(self) -> FloatArray:

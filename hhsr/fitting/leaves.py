@@ -82,17 +82,17 @@ class Workshop:
 
     def __init__(self, solid: Solid) -> None:
         self.solid = solid
-        self._kept: dict[int, Prepared] = {}
+        self._kept: dict[tuple[int, int], Prepared] = {}
 
-    def prepared(self, pieces: Sequence[Piece]) -> list[Prepared]:
-        """Return the pieces prepared, looking at those that are new."""
-        new = [piece for piece in pieces if id(piece) not in self._kept]
-        for piece, found in zip(new, in_threads(lambda k: self._look(new[k]), len(new)), strict=True):
-            self._kept[id(piece)] = found
-        return [self._kept[id(piece)] for piece in pieces]
+    def prepared(self, pieces: Sequence[Piece], stride: int) -> list[Prepared]:
+        """Return the pieces prepared with one of `stride` samples and rays, looking at those that are new."""
+        new = [piece for piece in pieces if (id(piece), stride) not in self._kept]
+        for piece, found in zip(new, in_threads(lambda k: self._look(new[k], stride), len(new)), strict=True):
+            self._kept[id(piece), stride] = found
+        return [self._kept[id(piece), stride] for piece in pieces]
 
-    def _look(self, piece: Piece) -> Prepared:
-        task = task_of(self.solid, piece.region, piece.members, piece.centre, SEED)
+    def _look(self, piece: Piece, stride: int) -> Prepared:
+        task = task_of(self.solid, piece.region, piece.members, piece.centre, SEED, stride)
         half_axes = fit_ellipsoid(start_rows(task, self.solid).joined(hint_rows(task, self.solid)))
         return Prepared(piece, task, section_of(self.solid, piece.region, piece.centre), half_axes)
 
@@ -106,7 +106,7 @@ def fit_leaves(workshop: Workshop, pieces: Sequence[Piece], budget: int, effort:
     if free < 0:
         raise ValueError(f"budget: got {budget} numbers for {len(pieces)} leaves, expected {LEAF_NUMBERS} for each")
     solid = workshop.solid
-    ready = [r._replace(task=r.task.thinned(effort.stride)) for r in workshop.prepared(pieces)]
+    ready = workshop.prepared(pieces, effort.stride)
     tasks = [r.task for r in ready]
     grid = grid_for(int(np.clip(effort.atoms * budget / len(pieces), *FINEST)))
     none = ScaleField(grid, NONE, frozen([]))

@@ -16,6 +16,7 @@ from hhsr.model import MAX_DEPTH, Cut, FloatArray, IntArray, Node, RetainedPart,
 DIRECTIONS = 40
 OFFSETS = 11
 CENTRES = 12
+CENTRES_AROUND = 6
 COARSE = 2000
 LEAST_SHARE = 0.004
 WORST_POWER = 2.0
@@ -173,11 +174,14 @@ def best_centre(
     if inner.size == 0:
         middle = solid.samples.points[members].mean(axis=0)
         inner = np.array([int(((solid.inner - middle) ** 2).sum(axis=1).argmin())])
-    if start is None:
+    count = CENTRES
+    if start is not None:
+        count = CENTRES_AROUND
+    else:
         tried = inner[_spread(solid.inner[inner], solid.depth[inner], CENTRES)]
         start = solid.inner[tried[int(_seen_from(solid, tried, few, power)[0].argmin())]]
     near = inner[np.argsort(((solid.inner[inner] - start) ** 2).sum(axis=1), kind="stable")]
-    tried = near[: inner.size // CENTRES + 1 : max(inner.size // CENTRES**2, 1)][:CENTRES]
+    tried = near[: inner.size // CENTRES + 1 : max(inner.size // (CENTRES * count), 1)][:count]
     values, unseen = _seen_from(solid, tried, few, power)
     at = int(values.argmin())
     share = members.size / few.size

@@ -10,7 +10,7 @@ from hhsr.fitting.solid import Region, Solid, everywhere
 from hhsr.kernels.plane_moves import leaves_of, misfits_of_places
 from hhsr.model import FloatArray, IntArray
 
-SAMPLES = 5000
+SAMPLES = 3000
 ROUNDS = 2
 ANGLES = (0.2, 0.1, 0.05, 0.025)
 SHIFTS = np.linspace(-0.5, 0.5, 5)

@@ -24,7 +24,8 @@ SAMPLES_A_NUMBER = 12
 SAMPLES = (6_000, 40_000)
 NUMBERS_A_PIECE = 16
 MOST_PIECES = 32
-PATIENCE = 5
+PATIENCE = 4
+EACH_UP_TO = 6
 HIDDEN = 0.03
 SPIKE = 10.0
 MENDED = 2
@@ -116,7 +117,7 @@ def _scouts(workshop: Workshop, parting: Parting, budget: int) -> list[Choice]:
     for count in range(1, most + 1):
         if not parting.grown(count):
             break
-        if count < most and _hopeless(parting, count):
+        if count < most and (_hopeless(parting, count) or (count > EACH_UP_TO and count % 2)):
             continue
         layout = settled(workshop.solid, parting.layout(count))
         found.append(Choice(layout, _fit(workshop, layout, budget, SCOUT)))

@@ -9,7 +9,8 @@ import numpy as np
 import trimesh
 
 from hhsr.fitting.samples import area_samples, face_areas
-from hhsr.model import Cut, ErrorFigures, FloatArray, IntArray, ModelLeaf, Node, Tree, cuts, leaves, rotation_matrix
+from hhsr.local_error import CELLS, KEY, cells_of, encoded
+from hhsr.model import ErrorFigures, FloatArray, IntArray, ModelLeaf, Tree, cuts, leaves
 from hhsr.read.quality import measure_quality
 from hhsr.surface import Step
 from hhsr.triangle_tree import TriangleTree
@@ -34,7 +35,8 @@ def measure(
     """Return how far a shape and its source are apart, mm, and what its cuts and its topology are like.
 
     Area-uniform samples of the source against `shape.mesh()` and of the mesh against the source, each to its exact
-    nearest point, pooled. A sample counts for every leaf whose region holds it or its nearest point.
+    nearest point, pooled. A sample counts for every leaf (and cell: `hhsr.local_error`) that holds it or its nearest
+    point.
 
     Parameters
     ----------
@@ -48,7 +50,10 @@ def measure(
     mesh = shape.mesh()
     tree: Tree = shape.tree
     count = sum(1 for _ in leaves(tree.root))
-    report = {"cuts": cut_figures(tree, mesh), "topology": topology(source_vertices, source_faces, mesh)}
+    report: dict[str, Any] = {
+        "cuts": cut_figures(tree, mesh),
+        "topology": topology(source_vertices, source_faces, mesh),
+    }
     if len(mesh.faces) == 0:
         nothing = float(np.linalg.norm(np.ptp(source_vertices, axis=0)))
         figures = ErrorFigures(nothing, nothing, nothing)
@@ -58,10 +63,15 @@ def measure(
     there, foot, _ = TriangleTree(mesh.vertices, mesh.faces).closest(on_source)
     back, root_foot, _ = TriangleTree(source_vertices, source_faces).closest(on_mesh)
     distance = np.concatenate([there, back])
-    owner = owners(tree, np.concatenate([on_source, on_mesh]))
-    other = owners(tree, np.concatenate([foot, root_foot]))
+    here = cells_of(tree, np.concatenate([on_source, on_mesh]))
+    over_there = cells_of(tree, np.concatenate([foot, root_foot]))
+    owner, other = here // CELLS, over_there // CELLS
     whole = figures_of(distance)
     per_leaf = tuple(figures_of(distance[(owner == i) | (other == i)]) for i in range(count))
+    largest = np.full(count * CELLS, -np.inf)
+    np.maximum.at(largest, here, distance)
+    np.maximum.at(largest, over_there, distance)
+    report[KEY] = encoded(largest, whole, per_leaf)
     return Measured(whole, per_leaf, report)
 
 
@@ -70,24 +80,6 @@ def figures_of(distance: FloatArray) -> ErrorFigures:
     if distance.size == 0:
         return ErrorFigures(0.0, 0.0, 0.0)
     return ErrorFigures(float(distance.mean()), float(np.percentile(distance, 95.0)), float(distance.max()))
-
-
-def owners(tree: Tree, points: FloatArray) -> IntArray:
-    """Return (n,) the leaf whose region holds each of (n, 3) LPS points, a band counted to its nearer side."""
-    local = (points - tree.pose[3:]) @ rotation_matrix(tree.pose[:3])
-    out = np.zeros(points.shape[0], dtype=np.int64)
-    _descend(tree.root, local, np.arange(points.shape[0]), out, 0)
-    return out
-
-
-def _descend(node: Node, points: FloatArray, index: IntArray, out: IntArray, number: int) -> int:
-    """Write the number of the leaf for the chosen points; return the number of the next leaf."""
-    if not isinstance(node, Cut):
-        out[index] = number
-        return number + 1
-    right = points[index] @ node.normal - node.offset >= 0.0
-    number = _descend(node.left, points, index[~right], out, number)
-    return _descend(node.right, points, index[right], out, number)
 
 
 def cut_figures(tree: Tree, mesh: trimesh.Trimesh) -> list[dict[str, Any]]:

@@ -33,7 +33,7 @@ class Task(NamedTuple):
     urgency: (b,) by how much a miss counts more: falling short by a hair opens a void as deep as the solid is there.
     hint: (b,) mm, where the ray leaves the solid beyond the plane, at most half as far again.
     directions: (s + r + b, 3) along, free and behind together.
-    stride: of how many samples and rays one was kept.
+    stride: of how many samples and rays one was taken; their shares of each other stay.
     """
 
     region: Region
@@ -50,37 +50,19 @@ class Task(NamedTuple):
     urgency: FloatArray
     hint: FloatArray
     directions: FloatArray
-    stride: int = 1
-
-    def thinned(self, stride: int) -> Task:
-        """Return the task with one of `stride` samples and rays: their shares of each other stay."""
-        seen = np.flatnonzero(self.seen)[::stride]
-        kept = np.sort(np.concatenate([seen, np.flatnonzero(~self.seen)[::stride]]))
-        along, free, behind = self.along[::stride], self.free[::stride], self.behind[::stride]
-        return self._replace(
-            points=self.points[kept],
-            normals=self.normals[kept],
-            seen=self.seen[kept],
-            along=along,
-            radii=self.radii[::stride],
-            cosine=self.cosine[::stride],
-            free=free,
-            behind=behind,
-            bound=self.bound[::stride],
-            slack=self.slack[::stride],
-            urgency=self.urgency[::stride],
-            hint=self.hint[::stride],
-            directions=np.concatenate([along, free, behind]),
-            stride=stride,
-        )
+    stride: int
 
 
-def task_of(solid: Solid, region: Region, members: IntArray, centre: FloatArray, seed: int) -> Task:
-    """Return the task of the leaf of a region with some samples, for a centre inside the solid and the region."""
-    free = turned_fibonacci(RAYS, seed)
+def task_of(solid: Solid, region: Region, members: IntArray, centre: FloatArray, seed: int, stride: int = 1) -> Task:
+    """Return the task of the leaf of a region with some samples, for a centre inside the solid and the region.
+
+    stride: one of so many samples and rays is taken.
+    """
+    members = members[::stride]
+    free = turned_fibonacci(RAYS, seed)[::stride]
     reach, _, hit = _cast(solid, region, centre, free)
     free = free[~(np.isfinite(reach) & (hit > reach))]
-    behind = turned_fibonacci(BOUND_RAYS, seed + 1)
+    behind = turned_fibonacci(BOUND_RAYS, seed + 1)[::stride]
     reach, cosine, hit = _cast(solid, region, centre, behind)
     through = np.isfinite(reach) & (hit > reach)
     behind, reach, cosine, hit = behind[through], reach[through], cosine[through], hit[through]
@@ -105,6 +87,7 @@ def task_of(solid: Solid, region: Region, members: IntArray, centre: FloatArray,
         urgency * np.sqrt(np.maximum(cosine, GRAZING)),
         np.minimum(hit, FARTHEST_HINT * reach),
         np.concatenate([along, free, behind]),
+        stride,
     )
 
 

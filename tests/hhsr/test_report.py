@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from hhsr.fitting.report import figures_of, measure, owners
+from hhsr.fitting.report import figures_of, measure
+from hhsr.local_error import owners
 from hhsr.model import Cut, ModelLeaf, Node, RetainedPart, ScaleField, Superquadric, Tree, frozen
 from hhsr.shape import Shape
 
