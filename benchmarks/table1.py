@@ -1,6 +1,6 @@
 """Table 1 of the paper on real organs: mean error (mean ± sd over shapes, mm) against stored numbers, by every method.
 
-    python benchmarks/table1.py [--data ../shared/data] [--kind prostate|liver|all] [--only N] [--jobs 2]
+    python benchmarks/table1.py [--data ../shared/data] [--kind prostate|liver|all] [--only N] [--jobs 2] [METHOD …]
 
 The published counts (spherical harmonics 1089 and 4225, RBF 1536 and 4952) stand beside equal counts for all.
 """
@@ -29,17 +29,17 @@ PUBLISHED = {
 FRAMES = {"prostate": "RAS", "hubmap": "LSA"}
 
 
-def rows_of(path: Path, kind: str) -> list[Row]:
-    """Return all rows of one organ: every method at the equal budget, two at their published ones."""
+def rows_of(path: Path, kind: str, methods: Sequence[str]) -> list[Row]:
+    """Return the rows of one organ: the methods at the equal budget; without any, all, and two at published counts."""
     frame = next((frame for word, frame in FRAMES.items() if word in path.name), "LPS")
     surface = read_surface(path, frame=frame)
-    rows = compare(surface, [BUDGETS[kind]], (*RECIPES, *METHODS))
-    for method, budget in PUBLISHED[kind].items():
+    rows = compare(surface, [BUDGETS[kind]], methods or (*RECIPES, *METHODS))
+    for method, budget in PUBLISHED[kind].items() if not methods else ():
         rows += compare(surface, [budget], [method])
     return rows
 
 
-def safe_rows_of(job: tuple[Path, str]) -> tuple[str, list[Row], str]:
+def safe_rows_of(job: tuple[Path, str, Sequence[str]]) -> tuple[str, list[Row], str]:
     """Return an organ's name, its rows, and what went wrong."""
     try:
         return job[0].stem, rows_of(*job), ""
@@ -80,6 +80,7 @@ def main() -> int:
     parser.add_argument("--kind", choices=("prostate", "liver", "all"), default="all")
     parser.add_argument("--only", type=int, default=None, help="the first N organs of each kind")
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("methods", nargs="*", choices=[*RECIPES, *METHODS, []], metavar="METHOD")
     words = parser.parse_args()
     for kind in ("prostate", "liver") if words.kind == "all" else (words.kind,):
         files = sorted((words.data / kind).glob(f"{kind}_*.ply"))[: words.only]
@@ -89,7 +90,7 @@ def main() -> int:
         rows: list[Row] = []
         shapes: list[tuple[str, list[Row]]] = []
         with ProcessPoolExecutor(words.jobs, get_context("spawn")) as pool:
-            for name, found, problem in pool.map(safe_rows_of, [(file, kind) for file in files]):
+            for name, found, problem in pool.map(safe_rows_of, [(file, kind, words.methods) for file in files]):
                 print(
                     f"{name}: " + (problem or ", ".join(f"{r.method} {r.mean_mm:.3f}" for r in found)), file=sys.stderr
                 )

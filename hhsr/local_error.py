@@ -1,6 +1,6 @@
 """The error of a fit where it is asked for: the sampled maximum of a leaf's cell of directions (DESIGN §3).
 
-A file keeps one character a cell in its report, 24 cells a leaf: steps of 2^(1/4) below the shape's largest error,
+A file keeps one character a cell in its report, 24 cells a leaf: steps of √2 below the shape's largest error,
 rounded up. A margin near one spot need not obey a spike elsewhere.
 """
 
@@ -16,7 +16,7 @@ from hhsr.model import Cut, ErrorFigures, FloatArray, IntArray, ModelLeaf, Node,
 
 EDGE = 2
 CELLS = 6 * EDGE * EDGE
-STEPS_A_HALVING = 4
+STEPS_A_HALVING = 2
 LETTERS = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
 KEY = "cells"
 

@@ -83,6 +83,19 @@ class Layout:
             pieces,
         )
 
+    def merged(self, solid: Solid, plane: int) -> Layout:
+        """Return the layout without a plane that has a piece on either side."""
+        first, second = sorted(-1 - int(child) for child in self.children[plane])
+        one, other = self.pieces[first], self.pieces[second]
+        members = np.sort(np.concatenate([one.members, other.members]))
+        region = Region(one.region.normals[:-1], one.region.offsets[:-1])  # the last is this plane's own
+        both = Piece(region, members, *best_centre(solid, members, region, 1.0), one.depth - 1)
+        children = np.where(self.children == plane, -1 - first, self.children)
+        children = np.where(children > plane, children - 1, np.where(children < -1 - second, children + 1, children))
+        pieces = [both if k == first else piece for k, piece in enumerate(self.pieces) if k != second]
+        planes = self.planes[:plane] + self.planes[plane + 1 :]
+        return Layout(planes, np.delete(children, plane, axis=0), tuple(pieces))
+
     def tree(self, leaves: Sequence[Node]) -> Node:
         """Return the tree with these leaves, one a piece."""
 
@@ -257,13 +270,19 @@ class _View(NamedTuple):
 
         offsets: along the old normal; a turned plane keeps its height over the members' mean. None: even shares.
         """
-        points, normals = self.solid.samples.points, self.solid.samples.normals
-        own = points[self.members]
+        own = self.solid.samples.points[self.members]
         heights = np.einsum("di,ni->dn", directions, own)
         if offsets is None or old is None:
             planes = np.quantile(heights, np.linspace(0.0, 1.0, OFFSETS + 2)[1:-1], axis=1).T.copy()
         else:
             planes = np.einsum("di,i->d", directions - old, own.mean(axis=0))[:, None] + offsets[None, :]
+        return self.best_of(directions, heights, planes)
+
+    def best_of(
+        self, directions: FloatArray, heights: FloatArray, planes: FloatArray
+    ) -> tuple[FloatArray, float, float]:
+        """Return the best of the planes at offsets (d, k) along (d, 3) directions; heights: (d, m) of the members."""
+        points, normals = self.solid.samples.points, self.solid.samples.normals
         across = np.einsum("di,ci->dc", directions, self.centres)
         value, _ = best_centres(
             points, normals, self.members, self.gaps, heights, planes, self.centres, across, self.power

@@ -29,6 +29,8 @@ EACH_UP_TO = 6
 HIDDEN = 0.03
 SPIKE = 10.0
 MENDED = 2
+PRUNED = 2
+PRUNING_PAYS = 0.98
 
 
 class Choice(NamedTuple):
@@ -92,6 +94,7 @@ def _spent(workshop: Workshop, parting: Parting, budget: int) -> tuple[Node, Fit
         )
     scouts = _scouts(workshop, parting, budget)
     best = _mended(workshop, min(scouts, key=lambda choice: choice.score), budget)
+    best = _pruned(workshop, best, budget)
     fitted = _fit(workshop, best.layout, budget, THOROUGH)
     return best.layout.tree(fitted.leaves), fitted
 
@@ -107,6 +110,20 @@ def _mended(workshop: Workshop, best: Choice, budget: int) -> Choice:
         if not paying:
             break
         best = min(paying, key=lambda choice: choice.score)
+    return best
+
+
+def _pruned(workshop: Workshop, best: Choice, budget: int) -> Choice:
+    """Return the layout without the lowest cuts that do not pay, as long as one is found."""
+    while best.layout.planes:
+        lowest = np.flatnonzero((best.layout.children < 0).all(axis=1))
+        layouts = [best.layout.merged(workshop.solid, int(k)) for k in lowest]
+        layouts.sort(key=lambda layout: sum(piece.misfit for piece in layout.pieces))
+        tried = [Choice(layout, _fit(workshop, layout, budget, SCOUT)) for layout in layouts[:PRUNED]]
+        better = min(tried, key=lambda choice: choice.score)
+        if better.score >= PRUNING_PAYS * best.score:
+            break
+        best = better
     return best
 
 

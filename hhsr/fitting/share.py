@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from hhsr.errors import FitError
 from hhsr.fitting.options import FitOptions
 from hhsr.fitting.source import Source
@@ -10,6 +12,7 @@ from hhsr.fitting.uniform_field import LADDER, FieldFit, LeafRows, fit_field, le
 from hhsr.model import ModelLeaf
 
 LEAST_FALL = 0.05
+GOAL_SHARE = 0.8
 ROWS_PER_CENTRE = 8
 FILLING_STEPS = 7
 
@@ -38,14 +41,14 @@ def shared_out(ladders: list[Ladder], options: FitOptions, fixed: int, fill: boo
 
     With a budget: the step up some leaf's ladder that saves most mm³ per number is taken while it fits; what is left
     then makes all counts grow alike. Without one: each leaf climbs while a step lowers its error by 5 %, or until
-    max_mean_error_mm is met.
+    max_mean_error_mm and max_error_mm are met, or at 1,024 centres.
 
     Raises
     ------
     FitError : not even the bare superquadrics go into the budget.
     """
     if options.max_parameters is None:
-        return [ladder.fit(_climbed(ladder, options.max_mean_error_mm)) for ladder in ladders]
+        return [ladder.fit(_climbed(ladder, options)) for ladder in ladders]
     room = options.max_parameters - fixed - sum(ladder.fit(0).leaf.parameters for ladder in ladders)
     if room < 0:
         raise FitError(
@@ -57,15 +60,17 @@ def shared_out(ladders: list[Ladder], options: FitOptions, fixed: int, fill: boo
     return [ladder.fit(count) for ladder, count in zip(ladders, counts, strict=True)]
 
 
-def _climbed(ladder: Ladder, goal_mm: float | None) -> int:
-    """Return the count at which further centres no longer pay, or the goal is met."""
+def _climbed(ladder: Ladder, options: FitOptions) -> int:
+    """Return the count at which further centres no longer pay, or the goals are met."""
+    goals = options.max_mean_error_mm, options.max_error_mm
+    mean, largest = (GOAL_SHARE * goal if goal is not None else math.inf for goal in goals)
     count = 0
     for step in LADDER:
-        now, then = ladder.fit(count), ladder.fit(step)
-        if goal_mm is not None:
-            if now.mean_mm <= 0.8 * goal_mm:
+        now = ladder.fit(count)
+        if goals != (None, None):
+            if now.mean_mm <= mean and now.max_mm <= largest:
                 break
-        elif count >= 32 and then.mean_mm > (1.0 - LEAST_FALL) * now.mean_mm:
+        elif count >= 32 and ladder.fit(step).mean_mm > (1.0 - LEAST_FALL) * now.mean_mm:
             break
         count = step
     return count

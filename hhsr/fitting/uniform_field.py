@@ -129,10 +129,11 @@ def covered_centres(grid: CentreGrid, rows: LeafRows) -> IntArray:
 
 
 class FieldFit(NamedTuple):
-    """leaf: with its field. mean_mm: mean miss of its surface, hidden or not. area_error: Σ area · miss, mm³."""
+    """leaf: with its field. mean_mm, max_mm: miss of its surface, hidden or not. area_error: Σ area · miss, mm³."""
 
     leaf: ModelLeaf
     mean_mm: float
+    max_mm: float
     area_error: float
 
 
@@ -176,10 +177,12 @@ def _figures(field: ScaleField, leaf: ModelLeaf, miss: FloatArray, rows: LeafRow
     """Return the leaf with the field and what it misses: seen and hidden surface, dents where the region is full."""
     fitted = ModelLeaf(leaf.centre, leaf.rotation, leaf.superquadric, field)
     total = float((miss * rows.areas).sum())
-    total += float((rows.hidden_areas * np.abs(leaf_radius(fitted, rows.hidden) - rows.hidden_radii)).sum())
+    hidden = np.abs(leaf_radius(fitted, rows.hidden) - rows.hidden_radii)
+    total += float((rows.hidden_areas * hidden).sum())
+    largest = max(float(miss.max(initial=0.0)), float(hidden.max(initial=0.0)))
     area = float(rows.areas.sum() + rows.hidden_areas.sum())
     total += float((rows.empty_areas * np.maximum(rows.reach - leaf_radius(fitted, rows.empty), 0.0)).sum())
-    return FieldFit(fitted, total / max(area, 1e-300), total)
+    return FieldFit(fitted, total / max(area, 1e-300), largest, total)
 
 
 def best_centre(part: Part, source: Source, seed: int, candidates: int = 12) -> FloatArray | None:

@@ -58,6 +58,20 @@ def test_t1_of_one_never_cuts() -> None:
     assert not list(cuts(hhsr.fit(dumbbell(), options).tree.root))
 
 
+def test_the_papers_fit_spends_until_its_largest_error_is_met() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=20.0)
+    u = np.array(ball.vertices) / 20.0
+    bumpy = 20.0 * u * (1.0 + 0.05 * np.sin(5.0 * u[:, :1]) * np.cos(4.0 * u[:, 1:2]))
+    surface = hhsr.Surface.from_mesh(bumpy, np.array(ball.faces))
+    fits = [
+        hhsr.fit(surface, hhsr.FitOptions.paper(max_error_mm=goal, t1=1.0, samples=2000)) for goal in (1.0, 0.3, 0.1)
+    ]
+    assert fits[0].parameters < fits[1].parameters < fits[2].parameters
+    for fit, goal in zip(fits, (1.0, 0.3, 0.1), strict=True):
+        assert fit.fit_error is not None
+        assert fit.fit_error.max_mm < goal
+
+
 def test_what_cannot_be_modelled_is_retained_or_named() -> None:
     kept = hhsr.fit(dumbbell(), hhsr.FitOptions.paper(t_mm=3.0, t2_mm3=1e9, samples=1000))
     assert isinstance(kept.tree.root, RetainedPart)

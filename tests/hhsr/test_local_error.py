@@ -46,7 +46,7 @@ def test_a_spike_rules_its_own_cell_only(tmp_path: Path) -> None:
     assert shape.fit_error is not None
     assert shape.fit_error_at(tip + 0.1) == pytest.approx(shape.fit_error.max_mm)
     assert 1.5 < shape.fit_error_at(tip) < 2.1
-    assert (shape.fit_error_at(away) < 0.2).all()
+    assert (shape.fit_error_at(away) < 0.25).all()
     assert shape.fit_error_at(np.stack([away, away])).shape == (2, 2)
 
 
@@ -56,7 +56,7 @@ def test_no_sample_misses_by_more_than_its_cell_says() -> None:
     shape = Shape(tree, Provenance(fit_error=found.error, leaf_errors=found.leaf_errors, report=found.report))
     # Distance to the true solid at the source's own vertices; a cell's figure is sampled, so it may be a little short.
     distance = np.abs(shape.signed_distance(vertices))
-    assert (distance <= 1.3 * shape.fit_error_at(vertices) + 0.02).all()
+    assert (distance <= 1.2 * shape.fit_error_at(vertices) + 0.02).all()
     assert shape.fit_error_at(vertices).mean() < 0.5 * found.error.max_mm
 
 
@@ -67,11 +67,11 @@ def test_letters_are_never_below_what_they_stand_for() -> None:
     figures = [ErrorFigures(0.1, 0.2, float(np.nanmax(part))) for part in np.split(largest, 2)]
     whole = ErrorFigures(0.1, 0.2, max(f.max_mm for f in figures))
     letters = encoded(largest, whole, figures)
-    back = whole.max_mm * 2.0 ** (-np.array([LETTERS.index(c) for c in letters]) / 4.0)
+    back = whole.max_mm * 2.0 ** (-np.array([LETTERS.index(c) for c in letters]) / 2.0)
     wanted = np.where(np.isnan(largest), figures[0].max_mm, largest)
     assert (back >= wanted * (1.0 - 1e-6)).all()
     near = wanted > whole.max_mm * 1e-3
-    assert (back[near] <= 1.2 * wanted[near]).all()
+    assert (back[near] <= 1.42 * wanted[near]).all()
 
 
 def test_without_cells_the_leaf_says_and_without_figures_nobody() -> None:
