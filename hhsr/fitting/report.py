@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from hhsr.fitting.samples import area_samples, face_areas
-from hhsr.local_error import CELLS, KEY, cells_of, encoded
+from hhsr.local_error import CELLS, KEY, cells_of, encoded, owners
 from hhsr.model import ErrorFigures, FloatArray, IntArray, ModelLeaf, Tree, cuts, leaves
 from hhsr.read.quality import measure_quality
 from hhsr.surface import Step
@@ -63,16 +63,27 @@ def measure(
     there, foot, _ = TriangleTree(mesh.vertices, mesh.faces).closest(on_source)
     back, root_foot, _ = TriangleTree(source_vertices, source_faces).closest(on_mesh)
     distance = np.concatenate([there, back])
-    here = cells_of(tree, np.concatenate([on_source, on_mesh]))
-    over_there = cells_of(tree, np.concatenate([foot, root_foot]))
-    owner, other = here // CELLS, over_there // CELLS
+    owner = owners(tree, np.concatenate([on_source, on_mesh]))
+    other = owners(tree, np.concatenate([foot, root_foot]))
     whole = figures_of(distance)
     per_leaf = tuple(figures_of(distance[(owner == i) | (other == i)]) for i in range(count))
-    largest = np.full(count * CELLS, -np.inf)
-    np.maximum.at(largest, here, distance)
-    np.maximum.at(largest, over_there, distance)
-    report[KEY] = encoded(largest, whole, per_leaf)
+    spacing = float(np.sqrt(face_areas(source_vertices, source_faces).sum() / samples))
+    places = np.concatenate([on_source, on_mesh, foot, root_foot])
+    report[KEY] = encoded(_largest_of_cells(tree, places, np.tile(distance, 2), spacing), whole, per_leaf)
     return Measured(whole, per_leaf, report)
+
+
+def _largest_of_cells(tree: Tree, points: FloatArray, distance: FloatArray, spacing: float) -> FloatArray:
+    """Return the largest error (leaves · CELLS,) mm of the samples in or beside each cell; −inf: none.
+
+    A sample counts in every cell less than two spacings away along an axis: a peak between two samples may lie in
+    another cell than they do.
+    """
+    largest = np.full(CELLS * sum(1 for _ in leaves(tree.root)), -np.inf)
+    for step in (np.zeros((1, 3)), 2.0 * spacing * np.eye(3), -2.0 * spacing * np.eye(3)):
+        for shift in step:
+            np.maximum.at(largest, cells_of(tree, points + shift), distance)
+    return largest
 
 
 def figures_of(distance: FloatArray) -> ErrorFigures:
