@@ -32,9 +32,9 @@ def blob(scale: float = 1.0, detail: int = 4) -> tuple[np.ndarray, np.ndarray]:
     return scale * u * radius[:, None] * (30.0, 22.0, 17.0), np.array(ball.faces)
 
 
-def dumbbell() -> tuple[np.ndarray, np.ndarray]:
+def dumbbell(detail: int = 4) -> tuple[np.ndarray, np.ndarray]:
     """Two balls on a bent rod: no point sees all of it."""
-    ball = trimesh.creation.icosphere(subdivisions=4)
+    ball = trimesh.creation.icosphere(subdivisions=detail)
     v = np.array(ball.vertices)
     along = v[:, 0] * 60.0
     thick = 16.0 * np.sqrt(np.maximum(1.0 - v[:, 0] ** 2, 0.0)) * (0.35 + 0.65 * v[:, 0] ** 2)
@@ -167,8 +167,8 @@ def same(one: Node, other: Node) -> bool:
 
 
 def test_the_number_of_threads_changes_nothing() -> None:
-    vertices, faces = normalise(*dumbbell())[0], dumbbell()[1]
-    options = FitOptions(max_parameters=100)
+    vertices, faces = normalise(*dumbbell(3))[0], dumbbell(3)[1]
+    options = FitOptions(max_parameters=50)
     usual = numba.get_num_threads()
     fits = []
     try:
