@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numba import config
 
-from hhsr.kernels import field_rows, lookahead, refinement, selection
+from hhsr.kernels import field_rows, lookahead, plane_moves, refinement, selection
 from hhsr.kernels import greedy as greedy_kernels
 from hhsr.kernels.sphere_rbf import wendland_gaussian
 from hhsr.model import CentreGrid
@@ -242,6 +242,33 @@ def test_a_cut_between_two_spheres_finds_both_centres() -> None:
     assert which[:, 1, 1].tolist() == [-1, -1]  # no candidate lies beyond 40 mm
     assert np.isinf(misfit[:, 1, 1]).all()
     assert (misfit[:, 1, 0] > 1.0).all()  # one centre for both spheres
+
+
+def test_a_plane_between_three_spheres_is_judged_by_all_of_them() -> None:
+    middles = np.array([[-20.0, 0, 0], [0.0, 20.0, 0], [20.0, 0, 0]])
+    parts = [sphere_samples(m, 8.0) for m in middles]
+    points, slopes = np.concatenate([b[0] for b in parts]), np.concatenate([b[1] for b in parts])
+    normals, offsets = np.array([[1.0, 0, 0], [0, 1.0, 0]]), np.array([10.0, 10.0])
+    children = np.array([[1, -1], [-2, -3]])  # above the first plane leaf 0; below and above the second leaves 1 and 2
+    owner = plane_moves.leaves_of(points, normals, offsets, children)
+    assert owner.tolist() == np.repeat([1, 2, 0], 600).tolist()
+    assert (
+        plane_moves.leaves_of(points[:3], np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2), np.int64)).tolist() == [0] * 3
+    )
+    centres, gaps = middles[[2, 0, 1]], np.zeros((3, 1800))
+    gaps[1, 0] = 5.0
+    places = np.array([[0, 1.0, 0], [0, 1.0, 0], [0, 1.0, 0], [0, -1.0, 0]])
+    heights = np.array([10.0, 16.0, 30.0, -10.0])
+    found = plane_moves.misfits_of_places(
+        points, slopes, gaps, centres, normals, offsets, children, 1, places, heights, 10, 1.0
+    )
+    assert found[0] == pytest.approx(5.0, abs=1e-3)  # spheres from their middles, and one sample that is not seen
+    assert found[1] > 10.0  # a slice of the upper sphere goes to the left one's leaf
+    assert np.isinf(found[2:]).all()  # a leaf loses its samples; two centres change sides
+    few = plane_moves.misfits_of_places(
+        points, slopes, gaps, centres, normals, offsets, children, 1, places[:1], heights[:1], 601, 1.0
+    )
+    assert np.isinf(few).all()
 
 
 def test_gaussian_of_the_rows_is_the_leaf_one() -> None:
