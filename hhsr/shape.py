@@ -114,7 +114,7 @@ class Shape:
         array = as_points(points)
         require_finite(array, "points")
         flat = errors_at(self.tree, self.fit_error, self.leaf_errors, self.report, array.reshape(-1, 3))
-        return _scalar(flat.reshape(array.shape[:-1]))
+        return scalar(flat.reshape(array.shape[:-1]))
 
     @property
     def bounds(self) -> FloatArray:
