@@ -14,7 +14,6 @@ from numba import njit
 from hhsr.kernels.cell import chart_of, direction_of, face_of
 from hhsr.kernels.jet import has_jets, inverse_radius_jet
 from hhsr.kernels.layout import (
-    BEND_TABLE,
     CELLS,
     MODEL,
     OWNER_INT_SIZE,
@@ -24,7 +23,7 @@ from hhsr.kernels.layout import (
     OWNER_PLANES,
     OWNER_RECORD,
 )
-from hhsr.kernels.maps import plane_of
+from hhsr.kernels.maps import bend_over, plane_of
 
 STEPS = 5
 WIDEST = 3  # base cells a side that a ball may cover
@@ -119,12 +118,7 @@ def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, foot):
     j0, j1 = int((b - reach_b + 1.0) * 0.5 * n), min(int((b + reach_b + 1.0) * 0.5 * n), n - 1)
     if i1 - i0 >= WIDEST or j1 - j0 >= WIDEST:
         return distance, False
-    bend_lo, bend_hi = np.inf, -np.inf
-    base = ints[leaf + BEND_TABLE] + 2 * face * n * n
-    for i in range(i0, i1 + 1):
-        for j in range(j0, j1 + 1):
-            q = base + 2 * (i * n + j)
-            bend_lo, bend_hi = min(bend_lo, np.float64(tab[q])), max(bend_hi, np.float64(tab[q + 1]))
+    bend_lo, bend_hi = bend_over(tab, ints, leaf, face, i0, i1, j0, j1)
     if not (bend_lo > -np.inf and bend_hi < np.inf):
         return distance, False
     way = max(reach_a + abs(ca - a), reach_b + abs(cb - b))

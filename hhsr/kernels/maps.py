@@ -14,6 +14,7 @@ from hhsr.kernels.cell import cell_model, direction_of
 from hhsr.kernels.layout import (
     BEND_HI,
     BEND_LO,
+    BEND_TABLE,
     BLOCK_ROWS,
     BLOCKS_PER_SIDE,
     CELL_SIZE,
@@ -63,6 +64,18 @@ def cell_at(ints, leaf, face, a, b):
     half = 1.0 / (n * s)
     slot = ints[leaf + CELL_TABLE] + CELL_SIZE * ((word >> 4) + p * s + q)
     return slot, (2 * (i * s + p) + 1) * half - 1.0, (2 * (j * s + q) + 1) * half - 1.0, half
+
+
+@njit(cache=True, error_model="numpy")
+def bend_over(tab, ints, leaf, face, i0, i1, j0, j1):
+    """Return the range of the eigenvalues of ∂²W over base cells i0 … i1, j0 … j1 of a face."""
+    n = ints[leaf + CELLS]
+    bend_lo, bend_hi = np.inf, -np.inf
+    for i in range(i0, i1 + 1):
+        for j in range(j0, j1 + 1):
+            q = ints[leaf + BEND_TABLE] + 2 * ((face * n + i) * n + j)
+            bend_lo, bend_hi = min(bend_lo, np.float64(tab[q])), max(bend_hi, np.float64(tab[q + 1]))
+    return bend_lo, bend_hi
 
 
 @njit(cache=True, error_model="numpy")

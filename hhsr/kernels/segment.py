@@ -14,8 +14,6 @@ from numba import njit
 from hhsr.kernels.cell import cell_model, chart_of, inverse_radius
 from hhsr.kernels.jet import has_jets, inverse_radius_jet
 from hhsr.kernels.layout import (
-    BEND_HI,
-    BEND_LO,
     BOX,
     CELLS,
     ERROR,
@@ -27,7 +25,7 @@ from hhsr.kernels.layout import (
     SPREAD_B,
     VALUE,
 )
-from hhsr.kernels.maps import cell_at, level_start
+from hhsr.kernels.maps import bend_over, cell_at, level_start
 from hhsr.kernels.solve import share_to_t, solve_in_cell
 
 PIECES = 64  # depth of the bisection
@@ -224,44 +222,44 @@ def _face_crossings(
         elif w_hi < lo:
             verdict = 0
         elif side == n:
-            # Few cells: settle one at a time, parting the piece at their borders, the middle one first.
-            split = _border(a0, b0, a1, b1, n)
-            if split < 0.0:
-                a, b = 0.5 * (a0 + a1), 0.5 * (b0 + b1)
-                i, j = _index(a, n), _index(b, n)
-                word = ints[ints[leaf + PARTING] + (face * n + i) * n + j]
-                s = 1 << (word & 7)
-                split = _border(a0, b0, a1, b1, n * s)
-            if split < 0.0:
-                split = 0.5
-                o, ca, cb, _ = cell_at(ints, leaf, face, a, b)
+            a, b = 0.5 * (a0 + a1), 0.5 * (b0 + b1)
+            half_a, half_b = 0.5 * abs(a1 - a0) + 1e-12, 0.5 * abs(b1 - b0) + 1e-12
+            value = ga = gb = 0.0
+            bend_lo, bend_hi = bend_over(tab, ints, leaf, face, i0, i1, j0, j1)
+            if bend_hi - bend_lo < math.inf and has_jets(ints, leaf):
+                value, ga, gb = inverse_radius_jet(blob, ints, leaf, face, a, b)
+            if value > 0.0:
+                # The exact jet at the middle, and how far its bend lets W stray from it on the piece.
+                far2 = half_a * half_a + half_b * half_b
+                up, down = 0.5 * far2 * max(bend_hi, 0.0), 0.5 * far2 * min(bend_lo, 0.0)
+                stray = max(bend_hi, -bend_lo) * math.sqrt(far2)
                 verdict, state, count = _settle(
                     blob, ints, leaf, face, t0, a0, b0, w0, t1, a1, b1, w1,
-                    ca, cb, tab[o + VALUE], tab[o + SLOPE_A], tab[o + SLOPE_B], tab[o + ERROR], tab[o + SPREAD_A],
-                    tab[o + SPREAD_B], False, speed, resolution, tolerance, state, out, count,
+                    a, b, value + 0.5 * (up + down), ga, gb, 0.5 * (up - down) + 1e-12 * value, stray, stray,
+                    True, speed, resolution, tolerance, state, out, count,
                 )  # fmt: skip
-                half_a, half_b = 0.5 * abs(a1 - a0) + 1e-12, 0.5 * abs(b1 - b0) + 1e-12
-                bend_lo, bend_hi = np.float64(tab[o + BEND_LO]), np.float64(tab[o + BEND_HI])
-                if verdict == UNDECIDED and has_jets(ints, leaf) and bend_hi - bend_lo < math.inf:
-                    # The exact jet at the middle, and how far the bend of the cell lets W stray from it on the piece.
-                    value, ga, gb = inverse_radius_jet(blob, ints, leaf, face, a, b)
-                    if value > 0.0:
-                        far2 = half_a * half_a + half_b * half_b
-                        up, down = 0.5 * far2 * max(bend_hi, 0.0), 0.5 * far2 * min(bend_lo, 0.0)
-                        stray = max(bend_hi, -bend_lo) * math.sqrt(far2)
-                        verdict, state, count = _settle(
-                            blob, ints, leaf, face, t0, a0, b0, w0, t1, a1, b1, w1,
-                            a, b, value + 0.5 * (up + down), ga, gb, 0.5 * (up - down) + 1e-12 * value, stray, stray,
-                            False, speed, resolution, tolerance, state, out, count,
-                        )  # fmt: skip
-                if verdict == UNDECIDED:
-                    value, ga, gb, error, sa, sb, lo, hi, _, _ = cell_model(
-                        blob, ints, leaf, face, a, b, half_a, half_b
-                    )
+            else:
+                # No jets: settle one cell at a time, parting the piece at their borders, the middle one first.
+                split = _border(a0, b0, a1, b1, n)
+                if split < 0.0:
+                    word = ints[ints[leaf + PARTING] + (face * n + _index(a, n)) * n + _index(b, n)]
+                    split = _border(a0, b0, a1, b1, n << (word & 7))
+                if split < 0.0:
+                    split = 0.5
+                    o, ca, cb, _ = cell_at(ints, leaf, face, a, b)
                     verdict, state, count = _settle(
                         blob, ints, leaf, face, t0, a0, b0, w0, t1, a1, b1, w1,
-                        a, b, value, ga, gb, error, sa, sb, True, speed, resolution, tolerance, state, out, count,
+                        ca, cb, tab[o + VALUE], tab[o + SLOPE_A], tab[o + SLOPE_B], tab[o + ERROR], tab[o + SPREAD_A],
+                        tab[o + SPREAD_B], False, speed, resolution, tolerance, state, out, count,
                     )  # fmt: skip
+                    if verdict == UNDECIDED:
+                        value, ga, gb, error, sa, sb, lo, hi, _, _ = cell_model(
+                            blob, ints, leaf, face, a, b, half_a, half_b
+                        )
+                        verdict, state, count = _settle(
+                            blob, ints, leaf, face, t0, a0, b0, w0, t1, a1, b1, w1,
+                            a, b, value, ga, gb, error, sa, sb, True, speed, resolution, tolerance, state, out, count,
+                        )  # fmt: skip
         if verdict == UNDECIDED and depth < PIECES:
             a, b, w = a0 + split * (a1 - a0), b0 + split * (b1 - b0), w0 + split * (w1 - w0)
             t = share_to_t(split, t0, t1, w0, w1)
