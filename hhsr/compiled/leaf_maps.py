@@ -18,12 +18,13 @@ FINEST = 0.004  # mm: no cell is parted below this thickness
 SHRINKS = 8.0  # halving a cell divides its thickness by about this, while the remainder of the bound rules
 
 
-def fill_leaf_maps(blob: FloatArray, blob_view: FloatArray, owners: list[Owner]) -> Float32Array:
+def fill_leaf_maps(blob: FloatArray, blob_view: FloatArray, owners: list[Owner], parted: bool) -> Float32Array:
     """Prove the maps of the model leaves; return their tables and note in the blob where each lies among them."""
     ints = blob.view(np.int64)
     bases = in_parts(len(owners), 1, lambda i, j: [_base(blob_view, ints, o) for o in owners[i:j]])
     proven = [base for part in bases for base in part]
-    level = _levels([thickness for _, _, thickness in proven])
+    thick = [thickness for _, _, thickness in proven]
+    level = _levels(thick) if parted else [np.zeros(t.shape, dtype=np.int64) for t in thick]
     tables: list[Float32Array] = []
     place = 0
     for owner, (_, _, thickness), k in zip(owners, proven, level, strict=True):

@@ -28,10 +28,10 @@ BandTables = tuple[tuple[tuple[FloatArray, FloatArray], ...], ...]
 class Proofs(Records):
     """The steps that fill what is proven, in the order in which one needs the other."""
 
-    def fill_maps(self, blob: FloatArray) -> FloatArray:
-        """Return the blob with the maps of the leaves behind it."""
+    def fill_maps(self, blob: FloatArray, parted: bool) -> FloatArray:
+        """Return the blob with the maps of the leaves behind it; parted where the surface needs it, or not."""
         leaves = [owner for owner in self.owners if owner.kind == at.MODEL]
-        return appended(blob, fill_leaf_maps(blob, read_only(blob), leaves))
+        return appended(blob, fill_leaf_maps(blob, read_only(blob), leaves, parted))
 
     def fill_facets(self, blob: FloatArray) -> FloatArray:
         """Return the blob with the facets of all leaves behind it."""

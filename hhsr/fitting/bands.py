@@ -9,6 +9,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from hhsr.compiled import compile_tree
 from hhsr.evaluate import contour_radius
 from hhsr.fitting.contour import Lobe, fit_contour, inside_loop, loop_area, section_lobes, star_centre
 from hhsr.fitting.cuts import Plane
@@ -130,6 +131,8 @@ def add_bands(node: Node, part: Part, source: Source, options: FitOptions, room:
     node = replace(node, left=left, right=right)
     d = wanted_half_width(source, options)
     children = [Shape(Tree(child, frozen(np.zeros(6)))) for child in (left, right)]
+    for child in children:  # asked a few hundred times, and never for a distance
+        child.__dict__["compiled"] = compile_tree(child.tree, sketch=True)
     for _ in range(HALVINGS + 1 if d > 0.0 else 0):
         banded = banded_cut(node, children, part, source, options, d)
         if banded is not None:

@@ -134,7 +134,7 @@ class _Assembly:
 
     def _band_tables(self) -> BandTables:
         if self._tables is None:
-            self._tables = compile_tree(self.tree).band_tables
+            self._tables = compile_tree(self.tree, sketch=True).band_tables
         return self._tables
 
     def _where_many_meet(self, piece: Piece, d: float) -> NDArray[np.bool_]:
