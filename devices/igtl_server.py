@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import select
 import socket
 import struct
@@ -129,7 +130,7 @@ class IgtlServer:
         """Close all connections."""
         self._stopping.set()
         if self._thread is not None and self._wake is not None:
-            self._wake.send(b"x")
+            self._poke(self._wake)
             self._thread.join(5.0)
             self._wake.close()
             self._thread = self._wake = None
@@ -182,7 +183,12 @@ class IgtlServer:
     def _wake_up(self) -> None:
         """Have the thread send what did not go at once."""
         if self._wake is not None and any(client.waiting for client in self._clients.values()):
-            self._wake.send(b"x")
+            self._poke(self._wake)
+
+    @staticmethod
+    def _poke(wake: socket.socket) -> None:
+        with contextlib.suppress(OSError):  # the thread may have ended by itself already, or been poked enough
+            wake.send(b"x")
 
     def _flush(self, link: socket.socket) -> None:
         waiting = self._clients[link].waiting
