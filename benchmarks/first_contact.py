@@ -2,8 +2,8 @@
 
     python benchmarks/first_contact.py SCENE.toml … [--seeds 20]
 
-The truth is the first instant at which the noise-free capsule touches the fitted shape; the statement is the interval of
-the report that raised APPROACHING. Prints how often it held, how long before, and how wide; exits 1 below 19 of 20.
+The truth is the first instant at which the noise-free capsule touches the fitted shape; the statement is the interval
+of the report that raised APPROACHING. Prints how often it held, how long before, how wide; exits 1 below 19 of 20.
 """
 
 from __future__ import annotations
