@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from devices.errors import DeviceInputError, ProtocolError
-from devices.rotation import is_rigid, pose_from_quaternion
+from devices.rotation import is_rigid, pose_from_quaternion, quaternion_from_rotation
 
 __all__ = [
     "DEFAULT_PORT",
@@ -257,6 +257,14 @@ def encode_transforms(name: str, time_s: float, poses: Mapping[str, ArrayLike]) 
             raise DeviceInputError(f"{tool!r}: an OpenIGTLink name has at most {_NAME_BYTES} bytes")
         items.append(_TDATA_ITEM.pack(encoded, 2, 0, *_column_major(T, tool)))  # 2: 6-D tracker
     return encode("TDATA", name, time_s, b"".join(items))
+
+
+def encode_position(name: str, time_s: float, T: ArrayLike) -> bytes:
+    """Return a POSITION message: a (4, 4) pose, mm, as position and quaternion x y z w."""
+    pose = np.asarray(T, dtype=np.float64)
+    _column_major(pose, name)  # refuses what is no finite pose
+    w, x, y, z = quaternion_from_rotation(pose[:3, :3])
+    return encode("POSITION", name, time_s, struct.pack(">7f", *pose[:3, 3], x, y, z, w))
 
 
 def encode_status(name: str, time_s: float, status: Status) -> bytes:

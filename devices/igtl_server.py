@@ -23,6 +23,7 @@ from devices.igtl_messages import (
     MessageReader,
     Status,
     encode,
+    encode_position,
     encode_status,
     encode_transform,
     encode_transforms,
@@ -40,6 +41,8 @@ _STATUS_CODE = {
     ToolStatus.PARTIALLY_OUT_OF_VOLUME: 13,
     ToolStatus.INVALID: 2,
 }
+
+_ENCODERS = {"TRANSFORM": encode_transform, "POSITION": encode_position}
 
 
 @dataclass
@@ -77,8 +80,8 @@ class _Client:
 class IgtlServer:
     """Send frames to every client that connects, each message to each of them, in order.
 
-    A tool that is OK goes out as TRANSFORM with the frame's time in its header; one that is not goes out as STATUS,
-    never as a matrix. A client that asks for tracking data (STT_TDATA) gets all tools that are OK in one TDATA message
+    A tool that is OK goes out as TRANSFORM (or POSITION) with the frame's time in its header; one that is not
+    goes out as STATUS, never as a matrix. A client that asks for tracking data (STT_TDATA) gets all tools that are OK in one TDATA message
     instead, no more often than it asks for, until it sends STP_TDATA. A client that does not read is dropped once 8 MB
     wait for it; it never holds the others up.
 
@@ -89,13 +92,24 @@ class IgtlServer:
     host : str
     clock : Clock or None
         Turns frame times into the Unix times of message headers.
+    poses_as : {"TRANSFORM", "POSITION"}
+        The kind of message that a tool goes out as; a POSITION is shorter, with a quaternion.
     """
 
     _MOST_WAITING = 8 << 20
 
-    def __init__(self, port: int = DEFAULT_PORT, host: str = "127.0.0.1", clock: Clock | None = None) -> None:
+    def __init__(
+        self,
+        port: int = DEFAULT_PORT,
+        host: str = "127.0.0.1",
+        clock: Clock | None = None,
+        poses_as: str = "TRANSFORM",
+    ) -> None:
         if not 0 <= port < 65536:
             raise DeviceInputError(f"a TCP port lies in 0–65535, got {port}")
+        if poses_as not in _ENCODERS:
+            raise DeviceInputError(f"poses_as: got {poses_as!r}, expected one of {', '.join(_ENCODERS)}")
+        self._encode = _ENCODERS[poses_as]
         self.host, self.port = host, port
         self.clock = SystemClock() if clock is None else clock
         self.dropped = 0
@@ -154,7 +168,7 @@ class IgtlServer:
             T = pose.T_tracker_tool
             if T is not None and pose.status is ToolStatus.OK and is_rigid(T):
                 seen[name] = T
-                single.append(encode_transform(name, stamp_s, T))
+                single.append(self._encode(name, stamp_s, T))
                 continue
             status = ToolStatus.INVALID if pose.status is ToolStatus.OK else pose.status
             said = Status(_STATUS_CODE[status], 0, status.name[:20], status.value)

@@ -37,6 +37,7 @@ from devices.igtl_messages import (
     decode_poses,
     decode_status,
     encode,
+    encode_position,
     encode_status,
     encode_transform,
     encode_transforms,
@@ -449,3 +450,26 @@ def test_an_independent_server_is_read_and_its_nan_is_no_pose() -> None:
             assert pose.T_tracker_tool is None
         else:
             assert pose.T_tracker_tool[0, 3] == 10.0 * k
+
+
+def test_poses_go_out_as_positions_where_that_is_wanted() -> None:
+    with pytest.raises(DeviceInputError, match="expected one of TRANSFORM, POSITION"):
+        IgtlServer(0, poses_as="QTRANS")
+    with IgtlServer(0, poses_as="POSITION") as server, IgtlTracker("127.0.0.1", server.port) as tracker:
+        while not server.clients:
+            pass
+        server.send(TrackerFrame(number=1, time_s=1.0, tools={"Stylus": ToolPose(ToolStatus.OK, T)}))
+        server.send(TrackerFrame(number=2, time_s=1.1, tools={"Stylus": ToolPose(ToolStatus.OK, T)}))
+        pose = tracker.read().tools["Stylus"]
+    assert pose.status is ToolStatus.OK
+    np.testing.assert_allclose(pose.T_tracker_tool, T, atol=1e-4)
+
+
+def test_a_position_is_position_and_quaternion() -> None:
+    reader = MessageReader()
+    (message,) = reader.feed(encode_position("Probe", 12.5, T))
+    assert isinstance(message, Message)
+    assert (message.kind, message.name, len(message.content)) == ("POSITION", "Probe", 28)
+    np.testing.assert_allclose(decode_poses(message)["Probe"], T, atol=1e-4)
+    with pytest.raises(DeviceInputError):
+        encode_position("Probe", 12.5, np.full((4, 4), np.nan))
