@@ -80,10 +80,10 @@ class _Client:
 class IgtlServer:
     """Send frames to every client that connects, each message to each of them, in order.
 
-    A tool that is OK goes out as TRANSFORM (or POSITION) with the frame's time in its header; one that is not
-    goes out as STATUS, never as a matrix. A client that asks for tracking data (STT_TDATA) gets all tools that are OK in one TDATA message
-    instead, no more often than it asks for, until it sends STP_TDATA. A client that does not read is dropped once 8 MB
-    wait for it; it never holds the others up.
+    A tool that is OK goes out as TRANSFORM (or POSITION) with the frame's time in its header; one that is not goes out
+    as STATUS, never as a matrix. A client that asks for tracking data (STT_TDATA) gets all tools that are OK in one
+    TDATA message instead, no more often than it asks for, until it sends STP_TDATA. A client that does not read is
+    dropped once 8 MB wait for it; it never holds the others up.
 
     Parameters
     ----------

@@ -457,10 +457,10 @@ def test_poses_go_out_as_positions_where_that_is_wanted() -> None:
         IgtlServer(0, poses_as="QTRANS")
     with IgtlServer(0, poses_as="POSITION") as server, IgtlTracker("127.0.0.1", server.port) as tracker:
         while not server.clients:
-            pass
-        server.send(TrackerFrame(number=1, time_s=1.0, tools={"Stylus": ToolPose(ToolStatus.OK, T)}))
-        server.send(TrackerFrame(number=2, time_s=1.1, tools={"Stylus": ToolPose(ToolStatus.OK, T)}))
-        pose = tracker.read().tools["Stylus"]
+            tracker.read(0.01)
+        for k in range(2):
+            server.send(frame(k, server.clock.now_s() + 0.1 * k, {"Stylus": ToolPose(ToolStatus.OK, T)}))
+        pose = tracker.read(5.0).tools["Stylus"]
     assert pose.status is ToolStatus.OK
     np.testing.assert_allclose(pose.T_tracker_tool, T, atol=1e-4)
 
