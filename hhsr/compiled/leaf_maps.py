@@ -23,11 +23,11 @@ def fill_leaf_maps(blob: FloatArray, blob_view: FloatArray, owners: list[Owner],
     ints = blob.view(np.int64)
     bases = in_parts(len(owners), 1, lambda i, j: [_base(blob_view, ints, o) for o in owners[i:j]])
     proven = [base for part in bases for base in part]
-    thick = [thickness for _, _, thickness in proven]
+    thick = [thickness for _, _, thickness, _ in proven]
     level = _levels(thick) if parted else [np.zeros(t.shape, dtype=np.int64) for t in thick]
     tables: list[Float32Array] = []
     place = 0
-    for owner, (_, _, thickness), k in zip(owners, proven, level, strict=True):
+    for owner, (_, _, thickness, bend), k in zip(owners, proven, level, strict=True):
         record = ints[owner.record : owner.record + at.LEAF_INT_SIZE]
         first = np.concatenate([[0], np.cumsum(4 ** k.ravel())])
         start = int(record[at.PARTING])
@@ -36,11 +36,12 @@ def fill_leaf_maps(blob: FloatArray, blob_view: FloatArray, owners: list[Owner],
         record[at.RANGE_TABLE], record[at.BEND_TABLE] = place, place + ranges
         record[at.CELL_TABLE] = place + ranges + bends
         table = np.empty(ranges + bends + at.CELL_SIZE * int(first[-1]), dtype=np.float32)
+        table[ranges : ranges + bends] = bend.ravel()
         tables.append(table)
         place += table.size
 
     def fill(i: int, j: int) -> None:
-        for owner, (models, spans, thickness), table in list(zip(owners, proven, tables, strict=True))[i:j]:
+        for owner, (models, spans, thickness, _), table in list(zip(owners, proven, tables, strict=True))[i:j]:
             record = ints[owner.record : owner.record + at.LEAF_INT_SIZE]
             n, box, start = int(record[at.CELLS]), int(record[at.BOX]), int(record[at.PARTING])
             words = ints[start : start + thickness.size].reshape(thickness.shape)
@@ -54,12 +55,14 @@ def fill_leaf_maps(blob: FloatArray, blob_view: FloatArray, owners: list[Owner],
     return np.concatenate(tables) if tables else np.empty(0, dtype=np.float32)
 
 
-def _base(blob_view: FloatArray, ints: NDArray[np.int64], owner: Owner) -> tuple[Float32Array, FloatArray, FloatArray]:
+def _base(
+    blob_view: FloatArray, ints: NDArray[np.int64], owner: Owner
+) -> tuple[Float32Array, FloatArray, FloatArray, Float32Array]:
     n = int(ints[owner.record + at.CELLS])
     models, spans = np.empty((6, n, n, at.CELL_SIZE), dtype=np.float32), np.empty((6, n, n, 2))
-    thickness = np.empty((6, n, n))
-    prove_base(blob_view, owner.record, n, owner.planes_at, len(owner.planes), models, spans, thickness)
-    return models, spans, thickness
+    thickness, bends = np.empty((6, n, n)), np.empty((6, n, n, 2), dtype=np.float32)
+    prove_base(blob_view, owner.record, n, owner.planes_at, len(owner.planes), models, spans, thickness, bends)
+    return models, spans, thickness, bends
 
 
 def _levels(thickness: list[FloatArray]) -> list[NDArray[np.int64]]:

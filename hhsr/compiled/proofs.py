@@ -14,13 +14,17 @@ from hhsr.compiled.records import Owner, Records
 from hhsr.kernels import layout as at
 from hhsr.kernels import slab as slab_at
 from hhsr.kernels.crossing import first_exits
-from hhsr.kernels.facets import DISC_SIZE, FAN, fill_nodes, level_sizes, list_facets, place_facets
+from hhsr.kernels.discs import DISC_SIZE, WIDE, fill_discs, level_sizes
+from hhsr.kernels.facets import list_facets, place_facets
 from hhsr.kernels.region_box import leaf_box, part_box
+from hhsr.kernels.seeds import fill_seeds
 from hhsr.kernels.slab_bounds import fill_lobe_spheres
 from hhsr.kernels.voxels import fill_leaps, fill_voxels
 from hhsr.model import Cut, FloatArray, ModelLeaf, RetainedPart, rotation_matrix
 
 VOXELS_TOTAL = 500_000  # a byte each
+SEEDS_TOTAL = 60_000  # four bytes each
+EMPTY = 1e15  # mm: where a block has no disc
 
 BandTables = tuple[tuple[tuple[FloatArray, FloatArray], ...], ...]
 
@@ -47,27 +51,40 @@ class Proofs(Records):
         if not codes:
             return blob
         code, disc = np.concatenate(codes), np.concatenate(discs)
-        keys, groups = np.empty(len(code), dtype=np.int64), np.empty(len(code), dtype=np.int64)
-        place_facets(view, code, keys, groups)
+        if len(code) == 0:
+            return blob
+        keys = np.empty(len(code), dtype=np.int64)
+        place_facets(view, code, keys)
         order = np.argsort(keys, kind="stable")
-        code, disc, groups = code[order], disc[order], groups[order]
-        new = np.concatenate([[True], groups[1:] != groups[:-1]]) if len(code) else np.zeros(0, dtype=bool)
-        starts = np.flatnonzero(new)
-        slot = FAN * (np.cumsum(new) - 1) + np.arange(len(code)) - np.repeat(starts, np.diff([*starts, len(code)]))
-        room = FAN * len(starts)
-        facets, around = np.full(room, -1, dtype=np.int64), np.full((room, DISC_SIZE), -1.0)
-        facets[slot], around[slot] = code, disc
-        code, disc = facets, around
+        code, disc = code[order], disc[order]
         sizes = np.array(level_sizes(len(code)), dtype=np.int64)
-        nodes = np.empty((int(sizes.sum()), DISC_SIZE), dtype=np.float32)
-        if len(code):
-            fill_nodes(disc, sizes, nodes)
+        per_level = -(-sizes // WIDE)
+        blocks = np.full((int(per_level.sum()), DISC_SIZE, WIDE), EMPTY, dtype=np.float32)
+        fill_discs(disc, sizes, blocks)
         head, start = self.header(blob), len(blob)
         head[at.FACET_COUNT], head[at.FACET_CODES], head[at.FACET_LEVELS] = len(code), start, start + len(code)
-        first = 2 * (start + len(code) + 1 + 2 * len(sizes) - int(head[at.MAP_START]))
-        starts = first + DISC_SIZE * np.concatenate([[0], np.cumsum(sizes)[:-1]]) if len(sizes) else sizes
-        levels = np.column_stack([starts, sizes]).ravel()
-        return appended(appended(blob, np.concatenate([code, [len(sizes)], levels]).astype(np.int64)), nodes)
+        first = 2 * (start + len(code) + 3 + 2 * len(sizes) - int(head[at.MAP_START]))
+        levels = np.column_stack([np.concatenate([[0], np.cumsum(per_level)[:-1]]), sizes]).ravel()
+        numbers = np.concatenate([code, [len(sizes)], levels, [first, len(blocks)]]).astype(np.int64)
+        grown = appended(appended(blob, numbers), blocks)
+        return self._with_seeds(grown, disc)
+
+    def _with_seeds(self, blob: FloatArray, facets: FloatArray) -> FloatArray:
+        """Return the blob with the grid of seeds behind it. facets: (m, 8) discs, in the order of their codes."""
+        low, high = facets[:, :3].min(axis=0), facets[:, :3].max(axis=0)
+        extent = np.maximum(high - low, 1e-3 * float((high - low).max()) + 1e-9)
+        side = max(float(np.prod(extent) / SEEDS_TOTAL) ** (1.0 / 3.0), float(extent.max()) / 1000.0)
+        counts = np.ceil(extent / side).astype(np.int64)
+        seeds = np.empty(tuple(int(c) for c in counts), dtype=np.int32)
+        fill_seeds(np.ascontiguousarray(facets[:, :3]), low, side, seeds)
+        start = len(blob)
+        grown = appended(
+            appended(blob, np.concatenate([counts, [0]])),
+            np.array([*low, 1.0 / side, 2.0 * float(np.abs([low, high]).max())]),
+        )
+        head = self.header(grown)
+        head[at.SEED_CELLS], head[at.SEED_FRAME], head[at.SEEDS] = start, start + 4, start + 9
+        return appended(grown, seeds)
 
     def _cells(self, blob: FloatArray, owner: Owner) -> int:
         """Return how many cells the map of a leaf has."""

@@ -237,16 +237,15 @@ def _third(n_lo, n_hi, n1, n2, d, s1, s2, s3):
 
 @njit(cache=True, error_model="numpy")
 def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
-    """Return (value, slope_a, slope_b, error, spread_a, spread_b, lo, hi, bend_lo, bend_hi) of W over a rectangle.
+    """Return (value, slope_a, slope_b, error, spread_a, spread_b, lo, hi, bend_lo, bend_hi, kink, third) of W.
 
-    |W − value − slope·δ| ≤ error, |∂W − slope| ≤ spread, lo ≤ W ≤ hi, and the eigenvalues of ∂²W lie in [bend_lo,
-    bend_hi]
-    (infinite where the base is no ellipsoid or the field may be capped): all proven on the whole rectangle about (a,
-    b).
+    |W − value − slope·δ| ≤ error, |∂W − slope| ≤ spread, lo ≤ W ≤ hi, the eigenvalues of ∂²W lie in [bend_lo, bend_hi],
+    and ∂²W differs from that at the centre by no more than kink + r·third at r from it (infinite where the base is no
+    ellipsoid or the field may be capped): all proven on the whole rectangle about (a, b).
     `value` is the middle of that strip, not W at the centre. The rectangle must lie within one block of directions and
     straddle no coordinate plane.
     """
-    bend_lo, bend_hi = -math.inf, math.inf
+    bend_lo, bend_hi, kink, third = -math.inf, math.inf, math.inf, math.inf
     block = block_of(face, a, b)
     s, sa, sb, wide_a, wide_b, saa, sab, sbb, rest2, rest3 = scale_range(
         blob, ints, leaf, block, face, a, b, half_a, half_b
@@ -325,9 +324,11 @@ def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
         s2 = max(abs(saa), abs(sbb)) + abs(sab) + rest2 + r * rest3
         n1 = math.sqrt(max(-na_lo, na_hi) ** 2 + max(-nb_lo, nb_hi) ** 2)
         kink = n_hi * d_hi * d_hi * rest2
-        rise = r * _third(n_lo, n_hi, n1, max(scale_a, scale_b) / n_lo, d_hi, s1, s2, rest3)
-        bend_lo = min(aa, bb) - abs(ab) - (kink + rise) * (1.0 + 1e-9) - 1e-9 * abs(value)
-        bend_hi = max(aa, bb) + abs(ab) + (kink + rise) * (1.0 + 1e-9) + 1e-9 * abs(value)
+        third = _third(n_lo, n_hi, n1, max(scale_a, scale_b) / n_lo, d_hi, s1, s2, rest3)
+        rise = r * third
+        middle, wide = 0.5 * (aa + bb), math.sqrt(0.25 * (aa - bb) ** 2 + ab * ab)
+        bend_lo = middle - wide - (kink + rise) * (1.0 + 1e-9) - 1e-9 * abs(value)
+        bend_hi = middle + wide + (kink + rise) * (1.0 + 1e-9) + 1e-9 * abs(value)
         cross = half_a * half_b * abs(ab) + r * r * (0.5 * kink + rise / 6.0)
         low = 0.5 * (min(aa, 0.0) * half_a * half_a + min(bb, 0.0) * half_b * half_b) - cross
         high = 0.5 * (max(aa, 0.0) * half_a * half_a + max(bb, 0.0) * half_b * half_b) + cross
@@ -343,4 +344,4 @@ def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
             value += 0.5 * (low + high)
             reach = abs(slope_a) * half_a + abs(slope_b) * half_b + error
             w_lo, w_hi = max(w_lo, value - reach), min(w_hi, value + reach)
-    return value, slope_a, slope_b, error, spread_a, spread_b, w_lo, w_hi, bend_lo, bend_hi
+    return value, slope_a, slope_b, error, spread_a, spread_b, w_lo, w_hi, bend_lo, bend_hi, kink, third

@@ -1,11 +1,7 @@
-"""The surface of all model leaves as flat facets with proven thickness, under one hierarchy of discs.
+"""The surface of all model leaves as flat facets with proven thickness.
 
-A facet is a cell of a leaf's map whose surface may lie in the leaf's region. Facets are sorted along a Morton curve
-over each
-face; a square of four makes a node of level 0 (codes of −1 fill up where one is missing), four nodes one of the next
-level: no links are stored. A disc holds all surface of its
-facets: no farther than THICK from the plane through its centre (slots 0–2) across its normal (3–5), and within that no
-farther than RADIUS from the centre. Discs are in the tree's frame, those of nodes float32, rounded outward.
+A facet is a cell of a leaf's map whose surface may lie in the leaf's region. Facets are sorted along a Morton curve over
+each face; over them stands the hierarchy of `hhsr.kernels.discs`: no links are stored.
 """
 
 import math
@@ -43,9 +39,7 @@ from hhsr.kernels.maps import (
 )
 from hhsr.kernels.polygon import ROOM, clip_polygon
 
-FAN = 4  # facets of a node of level 0, and nodes of a node above
-THICK, RADIUS, DISC_SIZE = 6, 7, 8
-SLACK = 1e-6  # more than float32 rounds, relative
+THICK, RADIUS = 6, 7  # of a facet's disc (`hhsr.kernels.discs`)
 
 
 @njit(cache=True, error_model="numpy")
@@ -95,7 +89,7 @@ def list_facets(blob, owner, leaf, planes, count, codes, discs):
             o, face, a, b, half = facet_cell(ints, leaf, code)
             value, ga, gb, error = tab[o + VALUE], tab[o + SLOPE_A], tab[o + SLOPE_B], tab[o + ERROR]
             if not quad_radius_ok(value, ga, gb, error, half, half):
-                _, _, _, _, _, _, lo, hi, _, _ = cell_model(blob, ints, leaf, face, a, b, half, half)
+                _, _, _, _, _, _, lo, hi, _, _, _, _ = cell_model(blob, ints, leaf, face, a, b, half, half)
                 x, y, z, radius = cell_sphere(face, a, b, half, half, value, ga, gb, error, lo, hi)
                 if not outside_region(blob, planes, count, x, y, z, radius):
                     _put_disc(discs[found], frame, x, y, z, 0.0, 0.0, 1.0, radius, radius)
@@ -140,8 +134,8 @@ def _spread(x):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def place_facets(blob, codes, keys, groups):
-    """Fill (m,) places of the facets along a Morton curve over each face, and (m,) the square of four of each."""
+def place_facets(blob, codes, keys):
+    """Fill (m,) places of the facets along a Morton curve over each face."""
     ints = integers(blob)
     for q in range(codes.shape[0]):
         owner, base, cell = codes[q] >> 24, (codes[q] >> 9) & 0x7FFF, (codes[q] >> 1) & 0xFF
@@ -153,56 +147,3 @@ def place_facets(blob, codes, keys, groups):
         j = ((base % n << k) + (cell & ((1 << k) - 1))) << finer
         place = (_spread(i) << 1) | _spread(j)
         keys[q] = (((owner << 3) + base // (n * n)) << 32) | place
-        groups[q] = (keys[q] >> (2 * finer + 2)) << 3 | k
-
-
-def level_sizes(facets: int) -> list[int]:
-    """Return the nodes of each level, lowest first, until one node of FAN or fewer is left."""
-    sizes = [-(-facets // FAN)] if facets else []
-    while sizes and sizes[-1] > FAN:
-        sizes.append(-(-sizes[-1] // FAN))
-    return sizes
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def fill_nodes(discs, sizes, nodes):
-    """Fill the levels' discs (Σ sizes, 8) float32, lowest level first, from the sorted facets' discs (m, 8).
-
-    A disc of negative radius is none; every node has one that is.
-    """
-    start, span = 0, 1
-    for level in range(sizes.shape[0]):
-        span *= FAN
-        for i in range(sizes[level]):
-            first, last = i * span, min((i + 1) * span, discs.shape[0])
-            out = nodes[start + i]
-            for k in range(6):
-                total = 0.0
-                count = 0
-                for q in range(first, last):
-                    if discs[q, RADIUS] >= 0.0:
-                        total += discs[q, k]
-                        count += 1
-                out[k] = total / count
-            nx, ny, nz = np.float64(out[3]), np.float64(out[4]), np.float64(out[5])
-            length = math.sqrt(nx * nx + ny * ny + nz * nz)
-            if length > 1e-3:
-                out[3], out[4], out[5] = nx / length, ny / length, nz / length
-            else:
-                out[3], out[4], out[5] = 0.0, 0.0, 1.0
-            # The stored normal's own length, off 1 by its rounding, is allowed for by SLACK.
-            nx, ny, nz = np.float64(out[3]), np.float64(out[4]), np.float64(out[5])
-            thick = radius = 0.0
-            for q in range(first, last):
-                if discs[q, RADIUS] < 0.0:
-                    continue
-                rx, ry, rz = discs[q, 0] - out[0], discs[q, 1] - out[1], discs[q, 2] - out[2]
-                along = rx * nx + ry * ny + rz * nz
-                aside = math.sqrt(max(rx * rx + ry * ry + rz * rz - along * along, 0.0))
-                turn = min(abs(nx * discs[q, 3] + ny * discs[q, 4] + nz * discs[q, 5]), 1.0)
-                tilt = math.sqrt(1.0 - turn * turn) + SLACK
-                thick = max(thick, abs(along) + turn * discs[q, THICK] + tilt * discs[q, RADIUS])
-                radius = max(radius, aside + discs[q, RADIUS] + tilt * discs[q, THICK])
-            grow = SLACK * (abs(out[0]) + abs(out[1]) + abs(out[2]) + radius + thick)
-            out[THICK], out[RADIUS] = thick + grow, radius + grow
-        start += sizes[level]

@@ -15,13 +15,16 @@ EDGE_COUNT, EDGE_FLOATS = 6, 7
 PLANE_COUNT, PLANE_FLOATS = 8, 9
 POSE = 10  # float slot: rotation (9) and translation (3), tree frame to LPS
 LOWEST, HIGHEST = 11, 12  # float slots of the box of the solid, tree frame
-# Facets (hhsr.kernels.facets): how many, integer slot of their codes, integer slot of (levels, then start among the
-# float32 tables and number of nodes of each).
+# Facets (hhsr.kernels.facets): how many, integer slot of their codes, integer slot of (levels; of each the
+# number of its first block and of its discs; float32 slot and number of all blocks).
 FACET_COUNT, FACET_CODES, FACET_LEVELS = 13, 14, 15
 # Voxels (hhsr.kernels.voxels): integer slot of (nx, ny, nz), float slot of (lowest corner 3, side, 1/side), slot of the
 # bytes; 0 where there are none.
 VOXELS, VOXEL_FRAME, VOXEL_BYTES = 16, 17, 18
-HEADER_SIZE = 20
+# Seeds (hhsr.kernels.seeds): integer slot of (nx, ny, nz), float slot of (lowest corner 3, 1/side, greatest coordinate), slot of the int32
+# numbers of facets.
+SEED_CELLS, SEED_FRAME, SEEDS = 19, 20, 21
+HEADER_SIZE = 22
 
 # Nodes: 4 integers (kind, left, right, owner), 8 floats (normal 3, offset, half width).
 CUT, MODEL, RETAINED, SLAB = 0, 1, 2, 3
@@ -51,9 +54,9 @@ LANES = 8
 BLOCKS_PER_SIDE = 8
 
 # A cell: |W − (value + slope_a·δa + slope_b·δb)| ≤ error, |∂W/∂a − slope_a| ≤ spread_a, same for b.
-# The eigenvalues of ∂²W lie in [bend_lo, bend_hi].
+# ∂²W differs from that at the centre by no more than kink + third·r at r from it.
 CELL_SIZE = 8
-VALUE, SLOPE_A, SLOPE_B, ERROR, SPREAD_A, SPREAD_B, BEND_LO, BEND_HI = 0, 1, 2, 3, 4, 5, 6, 7
+VALUE, SLOPE_A, SLOPE_B, ERROR, SPREAD_A, SPREAD_B, KINK, THIRD = 0, 1, 2, 3, 4, 5, 6, 7
 FINEST_PARTING = 4  # a facet's code has eight bits for the cell
 
 

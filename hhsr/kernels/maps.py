@@ -12,8 +12,6 @@ from numba import njit
 
 from hhsr.kernels.cell import cell_model, direction_of
 from hhsr.kernels.layout import (
-    BEND_HI,
-    BEND_LO,
     BEND_TABLE,
     BLOCK_ROWS,
     BLOCKS_PER_SIDE,
@@ -21,12 +19,14 @@ from hhsr.kernels.layout import (
     CELL_TABLE,
     CELLS,
     ERROR,
+    KINK,
     LANES,
     PARTING,
     SLOPE_A,
     SLOPE_B,
     SPREAD_A,
     SPREAD_B,
+    THIRD,
     VALUE,
     integers,
 )
@@ -165,21 +165,26 @@ def outside_region(blob, planes, count, x, y, z, radius):
 
 
 @njit(cache=True, error_model="numpy")
-def _write(out, value, ga, gb, error, half, da, db, bend_lo, bend_hi):
+def _write(out, value, ga, gb, error, half, da, db, kink, third):
     out[VALUE], out[SLOPE_A], out[SLOPE_B] = value, ga, gb
     out[SPREAD_A], out[SPREAD_B] = (da + 1e-7 * abs(ga)) * UP, (db + 1e-7 * abs(gb)) * UP
     out[ERROR] = (error + 1e-7 * (value + (abs(ga) + abs(gb)) * half)) * UP
-    out[BEND_LO], out[BEND_HI] = bend_lo - 3e-7 * abs(bend_lo), bend_hi + 3e-7 * abs(bend_hi)
+    out[KINK], out[THIRD] = kink * UP, third * UP
+
+
+@njit(cache=True, error_model="numpy")
+def _put_bend(bends, face, i, j, bend_lo, bend_hi):
+    """Write a base cell's bend, rounded outward."""
+    bends[face, i, j, 0], bends[face, i, j, 1] = bend_lo - 3e-7 * abs(bend_lo), bend_hi + 3e-7 * abs(bend_hi)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def prove_base(blob, leaf, n, planes, count, models, spans, thickness):
+def prove_base(blob, leaf, n, planes, count, models, spans, thickness, bends):
     """Prove the base cells of a leaf.
 
     models: (6, n, n, CELL_SIZE) float32. spans: (6, n, n, 2) range of W. thickness: (6, n, n) mm, how far surface and
-    plane
-    can lie apart in the thickest of a cell's four quarters; 0 where the surface lies outside the leaf's region, so that
-    nothing asks for it.
+    plane can lie apart in the thickest of a cell's four quarters; 0 where the surface lies outside the leaf's region, so
+    that nothing asks for it. bends: (6, n, n, 2) float32, the bend of each base cell.
     """
     ints = integers(blob)
     half = 1.0 / n
@@ -187,8 +192,11 @@ def prove_base(blob, leaf, n, planes, count, models, spans, thickness):
         for i in range(n):
             for j in range(n):
                 a, b = (2 * i + 1) * half - 1.0, (2 * j + 1) * half - 1.0
-                value, ga, gb, error, da, db, lo, hi, b0, b1 = cell_model(blob, ints, leaf, face, a, b, half, half)
-                _write(models[face, i, j], value, ga, gb, error, half, da, db, b0, b1)
+                value, ga, gb, error, da, db, lo, hi, b0, b1, kink, third = cell_model(
+                    blob, ints, leaf, face, a, b, half, half
+                )
+                _put_bend(bends, face, i, j, b0, b1)
+                _write(models[face, i, j], value, ga, gb, error, half, da, db, kink, third)
                 spans[face, i, j, 0], spans[face, i, j, 1] = lo, hi
                 x, y, z, radius = cell_sphere(face, a, b, half, half, value, ga, gb, error, lo, hi)
                 if outside_region(blob, planes, count, x, y, z, radius):
@@ -197,7 +205,7 @@ def prove_base(blob, leaf, n, planes, count, models, spans, thickness):
                 worst = 0.0
                 for q in range(4):
                     ca, cb = a + (0.5 * half if q & 1 else -0.5 * half), b + (0.5 * half if q & 2 else -0.5 * half)
-                    value, ga, gb, error, _, _, lo, hi, _, _ = cell_model(
+                    value, ga, gb, error, _, _, lo, hi, _, _, _, _ = cell_model(
                         blob, ints, leaf, face, ca, cb, 0.5 * half, 0.5 * half
                     )
                     x, y, z, radius = cell_sphere(face, ca, cb, 0.5 * half, 0.5 * half, value, ga, gb, error, lo, hi)
@@ -216,7 +224,7 @@ def prove_cells(blob, leaf, n, parting, models, spans, cells, bends):
     """Prove the cells of every parted base cell, and narrow its span by theirs.
 
     parting: (6, n, n) words (`hhsr.kernels.layout`). models: of the base cells, used as they are where k = 0. cells:
-    (…, CELL_SIZE) float32. bends: (6, n, n, 2) float32, the bend of each base cell.
+    (…, CELL_SIZE) float32. bends: (6, n, n, 2) float32, the bend of each base cell, narrowed by theirs.
     """
     ints = integers(blob)
     for face in range(6):
@@ -226,23 +234,21 @@ def prove_cells(blob, leaf, n, parting, models, spans, cells, bends):
                 if k == 0:
                     for q in range(CELL_SIZE):
                         cells[first, q] = models[face, i, j, q]
-                    bends[face, i, j, 0], bends[face, i, j, 1] = cells[first, BEND_LO], cells[first, BEND_HI]
                     continue
                 s = 1 << k
                 half = 1.0 / (n * s)
                 low, high = 1e300, 0.0
-                bends[face, i, j, 0], bends[face, i, j, 1] = np.inf, -np.inf
+                bend_lo, bend_hi = np.inf, -np.inf
                 for p in range(s):
                     for q in range(s):
                         a, b = (2 * (i * s + p) + 1) * half - 1.0, (2 * (j * s + q) + 1) * half - 1.0
-                        value, ga, gb, error, da, db, lo, hi, b0, b1 = cell_model(
+                        value, ga, gb, error, da, db, lo, hi, b0, b1, kink, third = cell_model(
                             blob, ints, leaf, face, a, b, half, half
                         )
-                        _write(cells[first + p * s + q], value, ga, gb, error, half, da, db, b0, b1)
+                        _write(cells[first + p * s + q], value, ga, gb, error, half, da, db, kink, third)
                         low, high = min(low, lo), max(high, hi)
-                        cell = cells[first + p * s + q]
-                        bends[face, i, j, 0] = min(bends[face, i, j, 0], cell[BEND_LO])
-                        bends[face, i, j, 1] = max(bends[face, i, j, 1], cell[BEND_HI])
+                        bend_lo, bend_hi = min(bend_lo, b0), max(bend_hi, b1)
+                _put_bend(bends, face, i, j, bend_lo, bend_hi)
                 spans[face, i, j, 0], spans[face, i, j, 1] = (
                     max(spans[face, i, j, 0], low),
                     min(spans[face, i, j, 1], high),

@@ -1,19 +1,15 @@
 """The point of the model leaves' surface nearest to a segment (a point is a segment of no length): branch and bound.
 
-A node of the facets' hierarchy is discarded when its disc lies no nearer than the best point less the tolerance; a
-facet
-when its flat quad, clipped to the region and widened by its proven thickness, does; what is left is settled at the end.
+A disc of the facets' hierarchy is discarded when it lies no nearer than the best point less the tolerance; a facet when
+its flat quad, widened by its proven thickness, does; what is left is settled at the end.
 """
-
-import math
 
 import numpy as np
 from numba import njit
 
-from hhsr.kernels.cell import direction_of, face_of, inverse_radius
-from hhsr.kernels.facets import DISC_SIZE, FAN, RADIUS, THICK, facet_cell
-from hhsr.kernels.foot import step_to_foot
-from hhsr.kernels.jet import has_jets, inverse_radius_jet
+from hhsr.kernels.descent import descend
+from hhsr.kernels.discs import BLOCK, DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment
+from hhsr.kernels.facets import facet_cell
 from hhsr.kernels.layout import (
     ERROR,
     FACET_CODES,
@@ -25,184 +21,166 @@ from hhsr.kernels.layout import (
     OWNER_PLANE_FLOATS,
     OWNER_PLANES,
     OWNER_RECORD,
+    SEED_FRAME,
     SLOPE_A,
     SLOPE_B,
+    THIRD,
     VALUE,
 )
-from hhsr.kernels.maps import outside_region
 from hhsr.kernels.patch import (
     BEST,
     BEST_T,
+    FAR,
     FOOT,
     LATE,
     LENGTH2,
-    NODE_ROOM,
     START,
     TOLERANCE,
     VECTOR,
     cell_bound,
     distance_to,
     offer,
-    settle_cell,
+    refine_cell,
 )
+from hhsr.kernels.quadratic import settle_square
+from hhsr.kernels.seeds import seed_at
 from hhsr.kernels.tree import into_leaf, turn_into_leaf, turn_out_of_leaf
 
-
-@njit(cache=True, error_model="numpy")
-def node_bound(tab, o, search):
-    """Return a lower bound of the segment's distance to a node's disc."""
-    nx, ny, nz = np.float64(tab[o + 3]), np.float64(tab[o + 4]), np.float64(tab[o + 5])
-    thick, radius = np.float64(tab[o + THICK]), np.float64(tab[o + RADIUS])
-    rx, ry, rz = search[START] - tab[o], search[START + 1] - tab[o + 1], search[START + 2] - tab[o + 2]
-    h = rx * nx + ry * ny + rz * nz
-    if search[LENGTH2] == 0.0:
-        aside = math.sqrt(max(rx * rx + ry * ry + rz * rz - h * h, 0.0)) - radius
-        along = max(abs(h) - thick, 0.0)
-        return math.sqrt(along * along + aside * aside) if aside > 0.0 else along
-    # A segment: by the slab about the disc's plane, and by the ball about the disc.
-    dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
-    g = h + dx * nx + dy * ny + dz * nz
-    slab = min(abs(h), abs(g)) - thick if (h > 0.0) == (g > 0.0) else 0.0
-    t = min(max(-(rx * dx + ry * dy + rz * dz) / search[LENGTH2], 0.0), 1.0)
-    rx, ry, rz = rx + t * dx, ry + t * dy, rz + t * dz
-    return max(slab, math.sqrt(rx * rx + ry * ry + rz * rz) - math.sqrt(radius * radius + thick * thick))
+PATIENCE = 16  # facets that may wait
+SAMPLES = 4  # points of a segment that ask for a seed
 
 
 @njit(cache=True, error_model="numpy")
-def _facet(blob, ints, tab, code, refine, search, local, corners, spare, rects):
-    """Return a lower bound of the distance to a facet, having offered a point of it; if `refine`, settle it."""
+def _settle(blob, ints, tab, code, search, local, corners, spare, rects):
+    """Offer the nearest point of a facet, or prove that it holds none: by quadratics where no cut touches it."""
     owner = ints[OWNER_INTS] + OWNER_INT_SIZE * (code >> 24)
     leaf, planes = ints[owner + OWNER_RECORD], ints[owner + OWNER_PLANE_FLOATS]
     count = 0 if code & 1 else ints[owner + OWNER_PLANES]
     frame = ints[leaf + FRAME]
-    qx, qy, qz = into_leaf(blob, ints, leaf, search[START], search[START + 1], search[START + 2])
-    local[START], local[START + 1], local[START + 2] = qx, qy, qz
-    if search[LENGTH2] > 0.0:
-        dx, dy, dz = turn_into_leaf(blob, frame, search[VECTOR], search[VECTOR + 1], search[VECTOR + 2])
-        local[VECTOR], local[VECTOR + 1], local[VECTOR + 2] = dx, dy, dz
+    moving = search[LENGTH2] > 0.0
+    local[START], local[START + 1], local[START + 2] = into_leaf(
+        blob, ints, leaf, search[START], search[START + 1], search[START + 2]
+    )
+    if moving:
+        local[VECTOR], local[VECTOR + 1], local[VECTOR + 2] = turn_into_leaf(
+            blob, frame, search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
+        )
     local[BEST] = search[BEST]
     o, face, a, b, half = facet_cell(ints, leaf, code)
-    low = -1.0
-    if refine:
-        settle_cell(blob, ints, tab, leaf, planes, count, local, face, o, a, b, half, corners, spare, rects)
-    else:
+    if (
+        moving
+        or count > 0
+        or not np.float64(tab[o + THIRD]) < np.inf
+        or not settle_square(blob, ints, tab, leaf, planes, count, local, face, o, a, b, half, rects)
+    ):
         low = cell_bound(
             blob, ints, leaf, planes, count, local, face, a, b, half, np.float64(tab[o + VALUE]),
             np.float64(tab[o + SLOPE_A]), np.float64(tab[o + SLOPE_B]), np.float64(tab[o + ERROR]), corners, spare,
         )  # fmt: skip
+        if low <= local[BEST] - search[TOLERANCE]:
+            refine_cell(blob, ints, leaf, planes, count, local, face, a, b, half, corners, spare, rects)
     if local[BEST] < search[BEST]:
         x, y, z = turn_out_of_leaf(blob, frame, local[FOOT], local[FOOT + 1], local[FOOT + 2])
         offer(search, local[BEST], local[BEST_T], x + blob[frame], y + blob[frame + 1], z + blob[frame + 2])
-    return low
 
 
 @njit(cache=True, error_model="numpy")
-def _first_guess(blob, ints, tab, search, local, corners, spare, rects):
-    """Offer a point of the facets under the nearest node of each level, and Newton's steps from it: an early bound."""
-    levels, codes = ints[FACET_LEVELS], ints[FACET_CODES]
-    i = 0
-    for level in range(ints[levels] - 1, -1, -1):
-        start, size = ints[levels + 1 + 2 * level], ints[levels + 2 + 2 * level]
-        nearest, at = np.inf, i
-        for q in range(FAN * i, min(FAN * i + FAN, size)):
-            o = start + DISC_SIZE * q
-            distance, _ = distance_to(search, np.float64(tab[o]), np.float64(tab[o + 1]), np.float64(tab[o + 2]))
-            if distance < nearest:
-                nearest, at = distance, q
-        i = at
-    chosen = -1
-    for q in range(FAN * i, FAN * i + FAN):
-        code = ints[codes + q]
-        if code >= 0:
-            before = search[BEST]
-            _facet(blob, ints, tab, code, False, search, local, corners, spare, rects)
-            if search[BEST] < before:
-                chosen = code
-    if chosen < 0 or search[LENGTH2] > 0.0:
-        return
-    owner = ints[OWNER_INTS] + OWNER_INT_SIZE * (chosen >> 24)
-    leaf = ints[owner + OWNER_RECORD]
-    if not has_jets(ints, leaf):
-        return
-    frame = ints[leaf + FRAME]
-    px, py, pz = into_leaf(blob, ints, leaf, search[START], search[START + 1], search[START + 2])
-    x, y, z = into_leaf(blob, ints, leaf, search[FOOT], search[FOOT + 1], search[FOOT + 2])
-    face, a, b, _ = face_of(x, y, z)
-    for _ in range(3):
-        w, ga, gb = inverse_radius_jet(blob, ints, leaf, face, a, b)
-        if w == 0.0:
+def _seed(blob, ints, search):
+    """Offer surface points on the way down from the facet that is named near the search's point."""
+    code = ints[ints[FACET_CODES] + seed_at(blob, ints, search[START], search[START + 1], search[START + 2])]
+    leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * (code >> 24) + OWNER_RECORD]
+    _, face, a, b, _ = facet_cell(ints, leaf, code)
+    descend(blob, ints, code >> 24, face, a, b, search)
+
+
+@njit(cache=True, error_model="numpy")
+def _seed_segment(blob, ints, search, local):
+    """Offer a surface point near the search's segment: the nearest of a few points', then to and fro between the two."""
+    local[LENGTH2], local[TOLERANCE] = 0.0, search[TOLERANCE]
+    t = 0.0
+    for k in range(SAMPLES + 2):
+        if k < SAMPLES:
+            t = k / (SAMPLES - 1.0)
+        elif search[BEST] < FAR:
+            t = search[BEST_T]
+        else:
             return
-        a, b, m = step_to_foot(px, py, pz, face, a, b, w, ga, gb)
-        if not (m > 0.0 and abs(a) <= 1.0 and abs(b) <= 1.0):
-            return
-        w = inverse_radius(blob, ints, leaf, face, a, b)
-        x, y, z = direction_of(face, a, b)
-        x, y, z = x / w, y / w, z / w
-        distance = math.sqrt((px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2)
-        if not distance < search[BEST] - 0.1 * search[TOLERANCE] or outside_region(
-            blob, ints[owner + OWNER_PLANE_FLOATS], ints[owner + OWNER_PLANES], x, y, z, 1e-9
-        ):
-            return
-        x, y, z = turn_out_of_leaf(blob, frame, x, y, z)
-        offer(search, distance, 0.0, x + blob[frame], y + blob[frame + 1], z + blob[frame + 2])
+        for q in range(3):
+            local[START + q] = search[START + q] + t * search[VECTOR + q]
+        local[BEST] = FAR
+        _seed(blob, ints, local)
+        if local[BEST] < FAR:
+            distance, t = distance_to(search, local[FOOT], local[FOOT + 1], local[FOOT + 2])
+            offer(search, distance, t, local[FOOT], local[FOOT + 1], local[FOOT + 2])
 
 
 @njit(cache=True, error_model="numpy")
 def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spare, rects):
     """Improve the search (tree's frame) by the surface of all model leaves, each within its region.
 
-    nodes, keys: (LATE + NODE_ROOM,) scratch: pending nodes and their bounds, and from LATE on the facets yet to be
+    nodes, keys: (LATE + NODE_ROOM,) scratch: pending blocks and their bounds, and from LATE on the facets yet to be
     settled.
     """
     if ints[FACET_COUNT] == 0:
         return
     levels, codes = ints[FACET_LEVELS], ints[FACET_CODES]
-    level = ints[levels]
+    moving = search[LENGTH2] > 0.0
     local[VECTOR], local[VECTOR + 1], local[VECTOR + 2] = 0.0, 0.0, 0.0
+    if moving:
+        _seed_segment(blob, ints, search, local)
+    else:
+        _seed(blob, ints, search)
     local[LENGTH2], local[TOLERANCE] = search[LENGTH2], search[TOLERANCE]
-    _first_guess(blob, ints, tab, search, local, corners, spare, rects)
+    x, y, z = search[START], search[START + 1], search[START + 2]
+    dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
+    first = ints[levels + 1 + 2 * ints[levels]]
+    blocks = tab[first : first + BLOCK * ints[levels + 2 + 2 * ints[levels]]].reshape(-1, DISC_SIZE, WIDE)
+    bounds = np.empty(WIDE, dtype=np.float32)
+    reach = max(abs(x), abs(y), abs(z)) + max(abs(x + dx), abs(y + dy), abs(z + dz))
+    loose = LOOSE * (reach + blob[ints[SEED_FRAME] + 4])
+    limit = search[BEST] - search[TOLERANCE]
     depth, waiting = 1, 0
-    nodes[0], keys[0] = level << 40, 0.0  # the node above the highest level
+    nodes[0], keys[0] = (ints[levels] - 1) << 40, 0.0
     while depth > 0:
         depth -= 1
-        if keys[depth] > search[BEST] - search[TOLERANCE]:
+        if limit < 0.0 or keys[depth] > limit * limit:
             continue
         level, i = nodes[depth] >> 40, nodes[depth] & 0xFFFFFFFFFF
-        if level == 0:
-            for q in range(FAN * i, min(FAN * i + FAN, ints[FACET_COUNT])):
-                code = ints[codes + q]
-                if code < 0:
-                    continue
-                low = _facet(blob, ints, tab, code, False, search, local, corners, spare, rects)
-                if low <= search[BEST] - search[TOLERANCE]:
-                    if waiting == NODE_ROOM:  # the late ones begin where the nodes may reach
-                        _facet(blob, ints, tab, code, True, search, local, corners, spare, rects)
-                        continue
-                    # Sorted, the nearest last: they are settled when the search is over, against a tight bound.
-                    waiting += 1
-                    k = LATE + waiting - 1
-                    while k > LATE and keys[k - 1] < low:
-                        keys[k], nodes[k] = keys[k - 1], nodes[k - 1]
-                        k -= 1
-                    keys[k], nodes[k] = low, code
-            continue
-        level -= 1
         start, size = ints[levels + 1 + 2 * level], ints[levels + 2 + 2 * level]
+        if moving:
+            bound_to_segment(blocks, start + i, x, y, z, dx, dy, dz, loose, bounds)
+        else:
+            bound_to_point(blocks, start + i, x, y, z, loose, bounds)
         base = depth
-        for q in range(FAN * i, min(FAN * i + FAN, size)):
-            low = node_bound(tab, start + DISC_SIZE * q, search)
-            if low > search[BEST] - search[TOLERANCE]:
+        for c in range(min(WIDE, size - WIDE * i)):
+            low = np.float64(bounds[c])
+            if low > limit * limit:
                 continue
-            k = depth
-            while k > base and keys[k - 1] < low:
+            if level > 0:
+                # Inserted so that the nearest is next.
+                k = depth
+                while k > base and keys[k - 1] < low:
+                    keys[k], nodes[k] = keys[k - 1], nodes[k - 1]
+                    k -= 1
+                keys[k], nodes[k] = low, ((level - 1) << 40) + WIDE * i + c
+                depth += 1
+                continue
+            # Facets wait in order, the nearest last: most are settled when the search is over, against a tight bound.
+            k = LATE + waiting
+            while k > LATE and keys[k - 1] < low:
                 keys[k], nodes[k] = keys[k - 1], nodes[k - 1]
                 k -= 1
-            keys[k], nodes[k] = low, (level << 40) + q
-            depth += 1
+            keys[k], nodes[k] = low, ints[codes + WIDE * i + c]
+            waiting += 1
+            if waiting > PATIENCE:  # the bound is not tight yet
+                waiting -= 1
+                _settle(blob, ints, tab, nodes[LATE + waiting], search, local, corners, spare, rects)
+                limit = search[BEST] - search[TOLERANCE]
     while waiting > 0:
         waiting -= 1
-        if keys[LATE + waiting] <= search[BEST] - search[TOLERANCE]:
-            _facet(blob, ints, tab, nodes[LATE + waiting], True, search, local, corners, spare, rects)
+        limit = search[BEST] - search[TOLERANCE]
+        if limit >= 0.0 and keys[LATE + waiting] <= limit * limit:
+            _settle(blob, ints, tab, nodes[LATE + waiting], search, local, corners, spare, rects)
 
 
 @njit(cache=True, error_model="numpy")

@@ -1,4 +1,4 @@
-"""A cell's surface against a point or a segment: bounded by its flat quad, settled by exact jets or by parting it.
+"""A cell's surface against a point or a segment: bounded by its flat quad, settled by parting it.
 
 A search is a float array: its slots hold the segment and the best point so far.
 """
@@ -9,9 +9,8 @@ import numpy as np
 from numba import njit
 
 from hhsr.kernels.cell import cell_model, chart_of, direction_of, inverse_radius
-from hhsr.kernels.foot import ball_is_free, step_to_foot
 from hhsr.kernels.jet import has_jets, inverse_radius_jet
-from hhsr.kernels.layout import BEND_HI, BEND_LO, BOX, SLOPE_A, SLOPE_B, VALUE
+from hhsr.kernels.layout import BOX
 from hhsr.kernels.maps import (
     cell_corners,
     cell_sphere,
@@ -81,6 +80,29 @@ def offer_patch_point(blob, ints, leaf, planes, count, search, face, x, y, z, sh
 
 
 @njit(cache=True, error_model="numpy")
+def quick_bound(search, face, a, b, half, value, ga, gb, error):
+    """Return a lower bound of a point's distance to a cell's surface: by its plane, and within it by its middle.
+
+    0 where the cell is too steep for its plane.
+    """
+    if not quad_radius_ok(value, ga, gb, error, half, half):
+        return 0.0
+    gx, gy, gz = plane_of(face, a, b, value, ga, gb)
+    along = abs(gx * search[START] + gy * search[START + 1] + gz * search[START + 2] - 1.0) / math.sqrt(
+        gx * gx + gy * gy + gz * gz
+    )
+    low = max(along - model_thickness(face, a, b, half, half, value, ga, gb, error), 0.0)
+    if low > search[BEST] - search[TOLERANCE]:
+        return low
+    # No point of the quad is farther from its middle than its radius, nor the surface from the quad by more than that.
+    x, y, z = direction_of(face, a, b)
+    rx, ry, rz = search[START] - x / value, search[START + 1] - y / value, search[START + 2] - z / value
+    aside = math.sqrt(max(rx * rx + ry * ry + rz * rz - along * along, 0.0))
+    aside -= quad_radius(face, a, b, half, value, ga, gb) + ray_thickness(face, a, b, half, half, value, ga, gb, error)
+    return math.sqrt(low * low + aside * aside) if aside > 0.0 else low
+
+
+@njit(cache=True, error_model="numpy")
 def cell_bound(blob, ints, leaf, planes, count, search, face, a, b, half, value, ga, gb, error, corners, spare):
     """Return a lower bound of the segment's distance to the cell's surface in the region; offer a point of it.
 
@@ -100,25 +122,12 @@ def cell_bound(blob, ints, leaf, planes, count, search, face, a, b, half, value,
     gx, gy, gz = plane_of(face, a, b, value, ga, gb)
     along = 0.0
     if search[LENGTH2] == 0.0:
-        # A point: its distance to the whole plane is often bound enough.
+        low = quick_bound(search, face, a, b, half, value, ga, gb, error)
+        if low > search[BEST] - search[TOLERANCE]:
+            return low
         along = abs(gx * search[START] + gy * search[START + 1] + gz * search[START + 2] - 1.0) / math.sqrt(
             gx * gx + gy * gy + gz * gz
         )
-        limit = search[BEST] - search[TOLERANCE]
-        if along - thick > limit:
-            return along - thick
-        # And within it: no point of the quad is farther from its middle than this, nor the surface by more than
-        # `slant`.
-        slant = ray_thickness(face, a, b, half, half, value, ga, gb, error)
-        x, y, z = direction_of(face, a, b)
-        rx, ry, rz = search[START] - x / value, search[START + 1] - y / value, search[START + 2] - z / value
-        aside = math.sqrt(max(rx * rx + ry * ry + rz * rz - along * along, 0.0))
-        aside -= quad_radius(face, a, b, half, value, ga, gb) + slant
-        if aside > 0.0:
-            low = max(along - thick, 0.0)
-            low = math.sqrt(low * low + aside * aside)
-            if low > limit:
-                return low
     slant = ray_thickness(face, a, b, half, half, value, ga, gb, error)
     cell_corners(face, a, b, half, value, ga, gb, corners)
     size = 4
@@ -154,27 +163,25 @@ def cell_bound(blob, ints, leaf, planes, count, search, face, a, b, half, value,
 
 
 @njit(cache=True, error_model="numpy")
-def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, bend_lo, bend_hi, corners, spare, rects):
+def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, corners, spare, rects):
     """Part a cell until what is left of it can hold no nearer point. rects: (NODE_ROOM, 6) scratch.
 
-    Parts are bounded from their exact jet and the bend of what they are a part of, which is proven anew two halvings
-    on; by proven models alone where there are no jets.
+    Parts are bounded from their exact jet and the bend of what they are a part of, which is proven anew at every
+    halving; by proven models alone where there are no jets.
     """
     jets = has_jets(ints, leaf)
     rects[0, 0], rects[0, 1], rects[0, 2], rects[0, 3] = a, b, half, -1.0
-    rects[0, 4], rects[0, 5] = bend_lo, bend_hi
+    rects[0, 4], rects[0, 5] = -math.inf, math.inf
     depth = 1
-    first = True
     while depth > 0:
         depth -= 1
         a, b, half, low = rects[depth, 0], rects[depth, 1], rects[depth, 2], rects[depth, 3]
         bend_lo, bend_hi = rects[depth, 4], rects[depth, 5]
         if low > search[BEST] - search[TOLERANCE]:
             continue
-        if not first and jets:
-            _, _, _, _, _, _, _, _, lo, hi = cell_model(blob, ints, leaf, face, a, b, half, half)
+        if jets:
+            _, _, _, _, _, _, _, _, lo, hi, _, _ = cell_model(blob, ints, leaf, face, a, b, half, half)
             bend_lo, bend_hi = max(bend_lo, lo), min(bend_hi, hi)
-        first = False
         half *= 0.5
         base = depth
         for corner in range(4):
@@ -187,7 +194,7 @@ def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, bend_
                     up, down = half * half * max(bend_hi, 0.0), half * half * min(bend_lo, 0.0)
                     value, error = w + 0.5 * (up + down), 0.5 * (up - down) + 1e-12 * w
             if w == 0.0:
-                value, ga, gb, error, _, _, _, _, _, _ = cell_model(blob, ints, leaf, face, ca, cb, half, half)
+                value, ga, gb, error, _, _, _, _, _, _, _, _ = cell_model(blob, ints, leaf, face, ca, cb, half, half)
             low = cell_bound(
                 blob, ints, leaf, planes, count, search, face, ca, cb, half, value, ga, gb, error, corners, spare
             )
@@ -208,31 +215,3 @@ def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, bend_
             rects[k, 0], rects[k, 1], rects[k, 2], rects[k, 3] = ca, cb, half, low
             rects[k, 4], rects[k, 5] = bend_lo, bend_hi
             depth += 1
-
-
-@njit(cache=True, error_model="numpy")
-def settle_cell(blob, ints, tab, leaf, planes, count, search, face, o, a, b, half, corners, spare, rects):
-    """Settle a cell for good: by an exact jet near the foot of a point if that proves it, else by parting it."""
-    bend_lo, bend_hi = np.float64(tab[o + BEND_LO]), np.float64(tab[o + BEND_HI])
-    if search[LENGTH2] == 0.0 and bend_hi < math.inf:
-        px, py, pz = search[START], search[START + 1], search[START + 2]
-        ca, cb = a, b
-        value, ga, gb = np.float64(tab[o + VALUE]), np.float64(tab[o + SLOPE_A]), np.float64(tab[o + SLOPE_B])
-        for _ in range(2):
-            na, nb, m = step_to_foot(px, py, pz, face, ca, cb, value, ga, gb)
-            if not m > 0.0:
-                break
-            ca, cb = min(max(na, a - half), a + half), min(max(nb, b - half), b + half)
-            value, ga, gb = inverse_radius_jet(blob, ints, leaf, face, ca, cb)
-            if value == 0.0:
-                break
-            x, y, z = direction_of(face, ca, cb)
-            x, y, z = x / value, y / value, z / value
-            if not outside_region(blob, planes, count, x, y, z, 1e-9):
-                distance, t = distance_to(search, x, y, z)
-                offer(search, distance, t, x, y, z)
-            way = half + max(abs(ca - a), abs(cb - b))
-            radius = search[BEST] - search[TOLERANCE]
-            if radius <= 0.0 or ball_is_free(px, py, pz, radius, face, ca, cb, way, value, ga, gb, bend_lo, bend_hi):
-                return
-    refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, bend_lo, bend_hi, corners, spare, rects)

@@ -253,7 +253,7 @@ def _face_crossings(
                         tab[o + SPREAD_B], False, speed, resolution, tolerance, state, out, count,
                     )  # fmt: skip
                     if verdict == UNDECIDED:
-                        value, ga, gb, error, sa, sb, lo, hi, _, _ = cell_model(
+                        value, ga, gb, error, sa, sb, lo, hi, _, _, _, _ = cell_model(
                             blob, ints, leaf, face, a, b, half_a, half_b
                         )
                         verdict, state, count = _settle(

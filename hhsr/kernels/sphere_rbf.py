@@ -100,3 +100,40 @@ def gaussian_jet(cx, cy, cz, inverse_extents, weights, ux, uy, uz):
         fy += e * cy[j]
         fz += e * cz[j]
     return total, fx, fy, fz
+
+
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+def gaussian_bend(cm, ca, cb, inverse_extents, weights, um, ua, ub, q):
+    """Return (s, s_a, s_b, s_aa, s_ab, s_bb) in a face's chart, of the unit direction u = q·(m, a, b).
+
+    cm, ca, cb: (n,) the centres' coordinates along the face's major axis and along a and b. With τ = u·c:
+    τ_a = q (c_a − τ u_a), τ_aa = −q (2 τ_a u_a + τ q (1 − u_a²)), τ_ab = −q (τ_b u_a + τ_a u_b − τ q u_a u_b).
+    """
+    total = first_a = first_b = aa = ab = bb = along = 0.0
+    for j in range(weights.shape[0]):
+        tau = um * cm[j] + ua * ca[j] + ub * cb[j]
+        h = min((1.0 - tau) * inverse_extents[j], 1.0)
+        t = 2.0 * h - 1.0
+        t2 = t * t
+        t4 = t2 * t2
+        low = ((_P0 + _P1 * t) + (_P2 + _P3 * t) * t2) + ((_P4 + _P5 * t) + (_P6 + _P7 * t) * t2) * t4
+        root = low + ((_P8 + _P9 * t) + (_P10 + _P11 * t) * t2) * (t4 * t4)
+        quarter = root * root
+        rest = 1.0 - h
+        e = weights[j] * (quarter * quarter * _MIDDLE)
+        total += e * rest * rest
+        e *= inverse_extents[j]
+        e1 = e * rest * (4.0 * rest + 2.0)
+        # Beyond the border (h = 1) λ is 0, with all its derivatives.
+        e2 = (e if h < 1.0 else 0.0) * inverse_extents[j] * ((16.0 * rest + 16.0) * rest + 2.0)
+        ta, tb = q * (ca[j] - tau * ua), q * (cb[j] - tau * ub)
+        first_a += e1 * ta
+        first_b += e1 * tb
+        along += e1 * tau
+        aa += e2 * ta * ta
+        ab += e2 * ta * tb
+        bb += e2 * tb * tb
+    aa -= q * (2.0 * first_a * ua + along * q * (1.0 - ua * ua))
+    bb -= q * (2.0 * first_b * ub + along * q * (1.0 - ub * ub))
+    ab -= q * (first_b * ua + first_a * ub - along * q * ua * ub)
+    return total, first_a, first_b, aa, ab, bb

@@ -58,7 +58,8 @@ def test_every_cell_of_the_map_holds_what_it_promises(leaf: ModelLeaf) -> None:
     cell = tab[slot[:, None] + np.arange(at.CELL_SIZE)].astype(np.float64)
     guess = cell[:, at.VALUE] + cell[:, at.SLOPE_A] * half * u + cell[:, at.SLOPE_B] * half * v
     assert (np.abs(exact - guess) <= cell[:, at.ERROR]).all()
-    assert (cell[:, at.BEND_LO] <= cell[:, at.BEND_HI]).all()
+    assert (cell[:, at.KINK] >= 0).all()
+    assert (cell[:, at.THIRD] >= 0).all()
     # The slopes' spread, by differences along both axes within the cell.
     for axis, slope, spread in ((0, at.SLOPE_A, at.SPREAD_A), (1, at.SLOPE_B, at.SPREAD_B)):
         step = 1e-4 * half
@@ -89,7 +90,7 @@ def test_models_of_any_rectangle_hold(half: float) -> None:
                 if half > 0.05
                 else -1 + (block + rng.uniform(0.1, 0.9, 2)) / 4
             )
-            value, ga, gb, error, _, _, low, high, _, _ = cell_model(blob, ints, record, face, ca, cb, half, half)
+            value, ga, gb, error, _, _, low, high, _, _, _, _ = cell_model(blob, ints, record, face, ca, cb, half, half)
             da, db = half * rng.uniform(-1, 1, (2, 30))
             directions = np.array([direction_of(face, ca + x, cb + y) for x, y in zip(da, db, strict=True)])
             exact = inverse_radii(leaf, directions)

@@ -1,0 +1,105 @@
+"""From a point near the surface to the foot of a point, on one smooth leaf after another: Newton's steps on exact jets.
+
+Nothing is proven by it: where it ends the surface point is an upper bound.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from hhsr.kernels.cell import direction_of, face_of
+from hhsr.kernels.jet import has_jets, inverse_radius_bend
+from hhsr.kernels.layout import (
+    FRAME,
+    MODEL,
+    OWNER_INT_SIZE,
+    OWNER_INTS,
+    OWNER_KIND,
+    OWNER_PLANE_FLOATS,
+    OWNER_PLANES,
+    OWNER_RECORD,
+)
+from hhsr.kernels.maps import outside_region, plane_of
+from hhsr.kernels.patch import BEST, START, TOLERANCE, offer
+from hhsr.kernels.tree import into_leaf, owner_of, turn_out_of_leaf
+
+STEPS = 10
+
+
+@njit(cache=True, error_model="numpy")
+def descend(blob, ints, owner, face, a, b, search):
+    """Offer the surface points on a way of steepest nearing from (a, b) of an owner; return whether it came to a foot.
+
+    search: of a point, tree's frame.
+    """
+    last = np.inf
+    for _ in range(STEPS):
+        o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
+        leaf = ints[o + OWNER_RECORD]
+        if ints[o + OWNER_KIND] != MODEL or not has_jets(ints, leaf):
+            return False
+        planes, count = ints[o + OWNER_PLANE_FLOATS], ints[o + OWNER_PLANES]
+        frame = ints[leaf + FRAME]
+        px, py, pz = into_leaf(blob, ints, leaf, search[START], search[START + 1], search[START + 2])
+        w, wa, wb, waa, wab, wbb = inverse_radius_bend(blob, ints, leaf, face, a, b)
+        if w == 0.0:
+            return False
+        m = 1.0 / w
+        x, y, z = direction_of(face, a, b)
+        x, y, z = x * m, y * m, z * m
+        rx, ry, rz = px - x, py - y, pz - z
+        distance = math.sqrt(rx * rx + ry * ry + rz * rz)
+        within = not outside_region(blob, planes, count, x, y, z, 1e-9)
+        if within and distance < search[BEST]:
+            ox, oy, oz = turn_out_of_leaf(blob, frame, x, y, z)
+            offer(search, distance, 0.0, ox + blob[frame], oy + blob[frame + 1], oz + blob[frame + 2])
+        gx, gy, gz = plane_of(face, a, b, w, wa, wb)
+        gg = gx * gx + gy * gy + gz * gz
+        h = (gx * rx + gy * ry + gz * rz) / gg
+        if within and distance - abs(h) * math.sqrt(gg) < 0.02 * search[TOLERANCE]:
+            return True
+        # Newton: with B the second derivatives of m·W in space, (1 + h B) δ = what of q − x lies in the tangent plane,
+        # for δ in it. In the chart δ = x_a δa + x_b δb, and x_i·B x_j = m W_ij.
+        ax, ay, az = direction_of(face, 0.0, 0.0)
+        ux, uy, uz = direction_of(face, 1.0, 0.0)
+        vx, vy, vz = direction_of(face, 0.0, 1.0)
+        ux, uy, uz = (ux - ax) * m - x * wa * m, (uy - ay) * m - y * wa * m, (uz - az) * m - z * wa * m
+        vx, vy, vz = (vx - ax) * m - x * wb * m, (vy - ay) * m - y * wb * m, (vz - az) * m - z * wb * m
+        k = h * m
+        aa = ux * ux + uy * uy + uz * uz + k * waa
+        ab = ux * vx + uy * vy + uz * vz + k * wab
+        bb = vx * vx + vy * vy + vz * vz + k * wbb
+        ra, rb = ux * rx + uy * ry + uz * rz, vx * rx + vy * ry + vz * rz
+        det = aa * bb - ab * ab
+        if not (det > 0.0 and aa > 0.0):  # beyond the centre of curvature: along the slope, as on a plane
+            aa, ab = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz
+            bb = vx * vx + vy * vy + vz * vz
+            det = aa * bb - ab * ab
+        da, db = (bb * ra - ab * rb) / det, (aa * rb - ab * ra) / det
+        move = max(abs(da), abs(db))
+        if move > 0.25:
+            da, db = da * (0.25 / move), db * (0.25 / move)
+            move = 0.25
+        if within and move > 0.9 * last:
+            return False
+        last = move
+        a, b = a + da, b + db
+        w += wa * da + wb * db
+        if not w > 0.0:
+            return False
+        x, y, z = direction_of(face, a, b)
+        x, y, z = x / w, y / w, z / w
+        if outside_region(blob, planes, count, x, y, z, 0.0):
+            ox, oy, oz = turn_out_of_leaf(blob, frame, x, y, z)
+            ox, oy, oz = ox + blob[frame], oy + blob[frame + 1], oz + blob[frame + 2]
+            new = owner_of(blob, ints, 0, ox, oy, oz)
+            if new != owner:
+                owner = new
+                leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * owner + OWNER_RECORD]
+                x, y, z = into_leaf(blob, ints, leaf, ox, oy, oz)
+                face, a, b, _ = face_of(x, y, z)
+                last = np.inf
+        elif max(abs(a), abs(b)) > 1.0:
+            face, a, b, _ = face_of(x, y, z)
+    return False

@@ -1,0 +1,139 @@
+"""A cell's surface against a point, by the exact jet of second order at its middle: one quadratic settles most cells.
+
+At δ from x₀ = dir₀/W₀ in the chart W = T + E, T linear, |E − ½ δᵀB₀δ| ≤ ½ (kink + third·r/3) |δ|² for |δ| ≤ r. With s the
+surface point, v = q − x₀, A = |v|, U δ = e_a δa + e_b δb − dir₀ (∂W·δ)/W₀ and k = A² − R² + 2 v·dir₀/W₀:
+
+    W (|s − q|² − R²) = (W₀ + ∂W·δ)(A² − R²) − 2 v·Uδ + k E + |U δ − (E/W₀) dir₀|²/W
+
+exactly; what is not quadratic in δ is taken at its worst.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from hhsr.kernels.cell import direction_of, inverse_radius
+from hhsr.kernels.jet import inverse_radius_bend
+from hhsr.kernels.layout import KINK, THIRD
+from hhsr.kernels.maps import outside_region
+from hhsr.kernels.patch import BEST, FINEST, NODE_ROOM, START, TOLERANCE, distance_to, offer
+
+
+@njit(cache=True, error_model="numpy")
+def _along_edge(c, linear, square, half):
+    """Return (least, where) of c + linear·x + square·x² for |x| ≤ half."""
+    x = -half if linear > 0.0 else half
+    if square > 0.0:
+        x = min(max(-0.5 * linear / square, -half), half)
+    return c + (linear + square * x) * x, x
+
+
+@njit(cache=True, error_model="numpy")
+def least_over_square(c, ca, cb, aa, ab, bb, half):
+    """Return (least, a, b) of c + ca·a + cb·b + aa·a² + 2·ab·a·b + bb·b² over |a|, |b| ≤ half."""
+    det = aa * bb - ab * ab
+    if det > 0.0 and aa > 0.0:
+        a, b = 0.5 * (ab * cb - bb * ca) / det, 0.5 * (ab * ca - aa * cb) / det
+        if abs(a) <= half and abs(b) <= half:
+            return c + 0.5 * (ca * a + cb * b), a, b
+    least, where_a, where_b = np.inf, 0.0, 0.0
+    for end in range(4):
+        x = half if end % 2 == 0 else -half
+        if end < 2:
+            value, y = _along_edge(c + (ca + aa * x) * x, cb + 2.0 * ab * x, bb, half)
+            if value < least:
+                least, where_a, where_b = value, x, y
+        else:
+            value, y = _along_edge(c + (cb + bb * x) * x, ca + 2.0 * ab * x, aa, half)
+            if value < least:
+                least, where_a, where_b = value, y, x
+    return least, where_a, where_b
+
+
+@njit(cache=True, error_model="numpy")
+def square_is_clear(px, py, pz, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third):
+    """Return (clear, δa, δb): no surface over the square about (a, b) lies within `radius` of p (leaf's frame).
+
+    (w, wa, …): exact jet there. δ: where the quadratic is least, a good guess of the point nearest to p. Never clear
+    where W may vanish on the square.
+    """
+    x, y, z = direction_of(face, a, b)
+    ell = math.sqrt(x * x + y * y + z * z)
+    vx, vy, vz = px - x / w, py - y / w, pz - z / w
+    away2 = vx * vx + vy * vy + vz * vz
+    if face < 2:
+        va, vb = vy, vz
+    elif face < 4:
+        va, vb = vz, vx
+    else:
+        va, vb = vx, vy
+    along = vx * x + vy * y + vz * z
+    fa, fb = wa / w, wb / w
+    gaa = 1.0 - 2.0 * fa * a + fa * fa * ell * ell
+    gbb = 1.0 - 2.0 * fb * b + fb * fb * ell * ell
+    gab = fa * fb * ell * ell - fa * b - fb * a
+    longest = math.sqrt(0.5 * (gaa + gbb) + math.sqrt(0.25 * (gaa - gbb) ** 2 + gab * gab))
+    bend = 0.5 * abs(waa + wbb) + math.sqrt(0.25 * (waa - wbb) ** 2 + wab * wab)
+    r = half * math.sqrt(2.0)
+    rest = kink + third * r / 3.0
+    change = (math.sqrt(wa * wa + wb * wb) + 0.5 * (bend + rest) * r) * r
+    over = 1.0 / (w + change)
+    gap = away2 - radius * radius
+    k = gap + 2.0 * along / w
+    less = 0.5 * abs(k) * rest + longest * ell * (bend + rest) * r / (w * max(w - change, 1e-300))
+    least, da, db = least_over_square(
+        w * gap, wa * gap - 2.0 * (va - fa * along), wb * gap - 2.0 * (vb - fb * along),
+        gaa * over + 0.5 * k * waa - less, gab * over + 0.5 * k * wab, gbb * over + 0.5 * k * wbb - less, half,
+    )  # fmt: skip
+    slack = 1e-11 * (w + abs(wa) + abs(wb)) * (away2 + radius * radius)
+    return change < 0.5 * w and least > slack, da, db
+
+
+@njit(cache=True, error_model="numpy")
+def settle_square(blob, ints, tab, leaf, planes, count, search, face, o, a, b, half, rects):
+    """Settle a cell with jets for a point (leaf's frame): offer its nearest point, or prove that it holds none.
+
+    o: the cell's float32 slot. count: planes of the region that may touch the cell. rects: (NODE_ROOM, 6) scratch.
+    Returns whether it could; if not, nothing is proven.
+    """
+    kink, third = np.float64(tab[o + KINK]), np.float64(tab[o + THIRD])
+    px, py, pz = search[START], search[START + 1], search[START + 2]
+    rects[0, 0], rects[0, 1], rects[0, 2] = a, b, half
+    depth = 1
+    whole = True
+    while depth > 0:
+        depth -= 1
+        a, b, half = rects[depth, 0], rects[depth, 1], rects[depth, 2]
+        w, wa, wb, waa, wab, wbb = inverse_radius_bend(blob, ints, leaf, face, a, b)
+        if w == 0.0:
+            return False
+        clear = False
+        for turn in range(2):
+            radius = search[BEST] - search[TOLERANCE]
+            if radius <= 0.0:
+                return True
+            clear, da, db = square_is_clear(
+                px, py, pz, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink if whole else 2.0 * kink, third
+            )
+            if clear or turn == 1:
+                break
+            x, y, z = direction_of(face, a + da, b + db)
+            m = 1.0 / inverse_radius(blob, ints, leaf, face, a + da, b + db)
+            x, y, z = x * m, y * m, z * m
+            distance, _ = distance_to(search, x, y, z)
+            if not distance < search[BEST] or outside_region(blob, planes, count, x, y, z, 1e-9):
+                break
+            offer(search, distance, 0.0, x, y, z)
+        whole = False
+        if clear or half / w < FINEST:
+            continue
+        if depth + 4 > NODE_ROOM:
+            return False
+        half *= 0.5
+        for corner in range(4):
+            rects[depth, 0] = a + (half if corner & 1 else -half)
+            rects[depth, 1] = b + (half if corner & 2 else -half)
+            rects[depth, 2] = half
+            depth += 1
+    return True
