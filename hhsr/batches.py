@@ -8,6 +8,10 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from hhsr.model import FloatArray
 
 PARTS_PER_THREAD = 4
 
@@ -24,3 +28,19 @@ def in_parts(count: int, smallest: int, work: Callable[[int, int], Any]) -> list
     edges = [count * k // parts for k in range(parts + 1)]
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(work, edges[:-1], edges[1:]))
+
+
+def neighbours_first(points: FloatArray) -> NDArray[np.int64]:
+    """Return an order of points (n, 3) in which neighbours follow each other: they read the same tables.
+
+    Along Morton's curve over the box of the finite ones, 1,024 cells a side.
+    """
+    finite = np.isfinite(points)
+    low = np.min(points, axis=0, where=finite, initial=np.inf)
+    extent = np.max(points, axis=0, where=finite, initial=-np.inf) - low
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        share = (points - low) * (1023.0 / np.maximum(extent, 1e-300))
+    cell = np.where(finite, np.clip(np.nan_to_num(share), 0.0, 1023.0), 0.0).astype(np.int64)
+    for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
+        cell = (cell | (cell << shift)) & mask
+    return np.argsort(cell[:, 0] << 2 | cell[:, 1] << 1 | cell[:, 2], kind="stable")

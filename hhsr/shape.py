@@ -25,7 +25,7 @@ from hhsr.answers import (
     one_row,
     scalar,
 )
-from hhsr.batches import in_parts
+from hhsr.batches import in_parts, neighbours_first
 from hhsr.check import as_float, as_points, as_rigid, require_finite
 from hhsr.compiled import Compiled, compile_tree
 from hhsr.errors import FileFormatError, InputError
@@ -200,15 +200,17 @@ class Shape:
         array, mark = as_points(points), marks(on_invalid)
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-6, 1e3)
         flat = array.reshape(-1, 3)
-        distance, foot = np.empty(len(flat)), np.empty((len(flat), 3))
-        blob = self._blob
+        blob, order = self._blob, neighbours_first(flat)
+        near, away, at = flat[order], np.empty(len(flat)), np.empty((len(flat), 3))
         bad = sum(
             in_parts(
-                len(flat),
+                len(near),
                 1_000,
-                lambda i, j: distance_kernels.nearest_many(blob, flat[i:j], tolerance, distance[i:j], foot[i:j]),
+                lambda i, j: distance_kernels.nearest_many(blob, near[i:j], tolerance, away[i:j], at[i:j]),
             )
         )
+        distance, foot = np.empty_like(away), np.empty_like(at)
+        distance[order], foot[order] = away, at
         if bad and not mark:
             require_finite(array, "points")
         return foot.reshape(array.shape), scalar(distance.reshape(array.shape[:-1]))

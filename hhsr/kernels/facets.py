@@ -1,6 +1,6 @@
 """The surface of all model leaves as flat facets with proven thickness.
 
-A facet is a cell of a leaf's map whose surface may lie in the leaf's region. Facets are sorted along a Morton curve over
+A facet is a cell of a leaf's map whose surface may lie in the leaf's region. Facets are sorted along a curve over
 each face; over them stands the hierarchy of `hhsr.kernels.discs`: no links are stored.
 """
 
@@ -124,18 +124,24 @@ def list_facets(blob, owner, leaf, planes, count, codes, discs):
 
 
 @njit(cache=True, error_model="numpy")
-def _spread(x):
-    """Return the lowest 16 bits of x with a zero between each."""
-    x &= 0xFFFF
-    x = (x | (x << 8)) & 0x00FF00FF
-    x = (x | (x << 4)) & 0x0F0F0F0F
-    x = (x | (x << 2)) & 0x33333333
-    return (x | (x << 1)) & 0x55555555
+def _along_curve(i, j, side):
+    """Return the place of (i, j) along Hilbert's curve over a square of `side` (a power of 2): neighbours all the way."""
+    place = 0
+    s = side >> 1
+    while s > 0:
+        right, up = (1 if i & s else 0), (1 if j & s else 0)
+        place += s * s * ((3 * right) ^ up)
+        if up == 0:
+            if right == 1:
+                i, j = side - 1 - i, side - 1 - j
+            i, j = j, i
+        s >>= 1
+    return place
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def place_facets(blob, codes, keys):
-    """Fill (m,) places of the facets along a Morton curve over each face."""
+    """Fill (m,) places of the facets along a curve over each face."""
     ints = integers(blob)
     for q in range(codes.shape[0]):
         owner, base, cell = codes[q] >> 24, (codes[q] >> 9) & 0x7FFF, (codes[q] >> 1) & 0xFF
@@ -145,5 +151,5 @@ def place_facets(blob, codes, keys):
         finer = FINEST_PARTING - k
         i = ((base // n % n << k) + (cell >> k)) << finer
         j = ((base % n << k) + (cell & ((1 << k) - 1))) << finer
-        place = (_spread(i) << 1) | _spread(j)
+        place = _along_curve(i, j, n << FINEST_PARTING)
         keys[q] = (((owner << 3) + base // (n * n)) << 32) | place
