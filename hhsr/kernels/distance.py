@@ -29,7 +29,7 @@ from hhsr.kernels.layout import (
     integers,
     tables,
 )
-from hhsr.kernels.nearest import nearest_on_leaves, owner_planes
+from hhsr.kernels.nearest import nearest_on_leaves, owner_planes, seed_point
 from hhsr.kernels.nearest_part import box_bound, nearest_on_part
 from hhsr.kernels.nearest_slab import nearest_on_slab
 from hhsr.kernels.patch import (
@@ -220,50 +220,79 @@ def _highest(px, py, pz, dx, dy, dz, t0, t1, ax, ay, az, bx, by, bz):
 
 
 @njit(cache=True, error_model="numpy")
+def _put_span(spans, s, a, ax, ay, az, b, bx, by, bz):
+    spans[s, 0], spans[s, 1], spans[s, 2], spans[s, 3] = a, ax, ay, az
+    spans[s, 4], spans[s, 5], spans[s, 6], spans[s, 7] = b, bx, by, bz
+
+
+@njit(cache=True, error_model="numpy")
 def deepest(
-    blob, ints, tab, px, py, pz, dx, dy, dz, t0, t1, tolerance, floor, out,
+    blob, ints, tab, px, py, pz, dx, dy, dz, t0, t1, on0, on1, tolerance, floor, out,
     search, local, nodes, keys, corners, spare, rects, spans,
 ):  # fmt: skip
     """Return an upper bound, at most `tolerance` above the truth, of the depth on [t0, t1] where p + t·d is inside.
 
-    A nearest surface point found at one t bounds the depth at every other by its distance: intervals between two such
-    points are parted at their highest bound, until it exceeds the depth found by no more than the tolerance. `floor`:
-    a depth already known; no more than that need be proven below it. out: best t and foot (4,).
+    Any surface point bounds the depth at every t by its distance. So intervals between two t are bounded by the surface
+    points found at both, and parted where that bound is highest, by points found on the way down that nothing proves;
+    only where these lower it no more is the true distance asked. `floor`: a depth already known; no more than that need
+    be proven below it. on0, on1: the ends lie on the surface. out: best t and foot (4,).
     """
-    inner = 0.25 * tolerance
+    inner = 0.5 * tolerance
     best = floor
-    spans_used = 1
     for k in range(2):
         t = t0 if k == 0 else t1
-        set_search(search, px + t * dx, py + t * dy, pz + t * dz, 0.0, 0.0, 0.0, inner)
-        search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
-        o = 0 if k == 0 else 4
-        spans[0, o] = t
-        spans[0, o + 1], spans[0, o + 2], spans[0, o + 3] = search[FOOT], search[FOOT + 1], search[FOOT + 2]
-        if search[BEST] > best:
-            best = search[BEST]
-            out[0], out[1], out[2], out[3] = t, search[FOOT], search[FOOT + 1], search[FOOT + 2]
+        x, y, z = px + t * dx, py + t * dy, pz + t * dz
+        if not (on0 if k == 0 else on1):
+            set_search(search, x, y, z, 0.0, 0.0, 0.0, inner)
+            search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+            x, y, z = search[FOOT], search[FOOT + 1], search[FOOT + 2]
+            if search[BEST] > best:
+                best = search[BEST]
+                out[0], out[1], out[2], out[3] = t, x, y, z
+        o = 4 * k
+        spans[0, o], spans[0, o + 1], spans[0, o + 2], spans[0, o + 3] = t, x, y, z
+    used = 1
     high = best
-    while spans_used > 0:
-        spans_used -= 1
-        s = spans_used
-        a, ax, ay, az = spans[s, 0], spans[s, 1], spans[s, 2], spans[s, 3]
-        b, bx, by, bz = spans[s, 4], spans[s, 5], spans[s, 6], spans[s, 7]
+    while used > 0:
+        used -= 1
+        a, ax, ay, az = spans[used, 0], spans[used, 1], spans[used, 2], spans[used, 3]
+        b, bx, by, bz = spans[used, 4], spans[used, 5], spans[used, 6], spans[used, 7]
         value2, t = _highest(px, py, pz, dx, dy, dz, a, b, ax, ay, az, bx, by, bz)
         value = math.sqrt(value2)
-        if value <= best + tolerance or s + 2 > spans.shape[0] or not a < t < b:
+        if value <= best + inner or used + 2 > spans.shape[0]:
             high = max(high, value)
             continue
         set_search(search, px + t * dx, py + t * dy, pz + t * dz, 0.0, 0.0, 0.0, inner)
-        search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+        if a < t < b:
+            seed_point(blob, ints, search)
+        if not search[BEST] < value - 0.5 * inner:
+            # Nothing nearer is known, or the bound is highest where a point already found is the nearest known: what is
+            # the true distance there?
+            search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+            if search[BEST] > best:
+                best = search[BEST]
+                out[0], out[1], out[2], out[3] = t, search[FOOT], search[FOOT + 1], search[FOOT + 2]
+            if not a < t < b:
+                if not search[BEST] < value - 0.5 * inner:
+                    high = max(high, value)
+                    continue
+                if t <= a:
+                    ax, ay, az = search[FOOT], search[FOOT + 1], search[FOOT + 2]
+                else:
+                    bx, by, bz = search[FOOT], search[FOOT + 1], search[FOOT + 2]
+                _put_span(spans, used, a, ax, ay, az, b, bx, by, bz)
+                used += 1
+                continue
         x, y, z = search[FOOT], search[FOOT + 1], search[FOOT + 2]
-        if search[BEST] > best:
-            best = search[BEST]
-            out[0], out[1], out[2], out[3] = t, x, y, z
-        spans[s, 4], spans[s, 5], spans[s, 6], spans[s, 7] = t, x, y, z
-        spans[s + 1, 0], spans[s + 1, 1], spans[s + 1, 2], spans[s + 1, 3] = t, x, y, z
-        spans[s + 1, 4], spans[s + 1, 5], spans[s + 1, 6], spans[s + 1, 7] = b, bx, by, bz
-        spans_used += 2
+        _put_span(spans, used, a, ax, ay, az, t, x, y, z)
+        _put_span(spans, used + 1, t, x, y, z, b, bx, by, bz)
+        # The higher of the two next.
+        left, _ = _highest(px, py, pz, dx, dy, dz, a, t, ax, ay, az, x, y, z)
+        right, _ = _highest(px, py, pz, dx, dy, dz, t, b, x, y, z, bx, by, bz)
+        if left > right:
+            _put_span(spans, used, t, x, y, z, b, bx, by, bz)
+            _put_span(spans, used + 1, a, ax, ay, az, t, x, y, z)
+        used += 2
     return high
 
 
@@ -324,8 +353,8 @@ def clearance_many(blob, starts, ends, tolerance, value, t, foot):
             if inside and end >= begin:
                 deep = max(
                     deep,
-                    deepest(blob, ints, tab, px, py, pz, dx, dy, dz, begin, end, 0.7 * tolerance, deep, out, search,
-                            local, nodes, keys, corners, spare, rects, spans),
+                    deepest(blob, ints, tab, px, py, pz, dx, dy, dz, begin, end, k > 0, k < count, 0.8 * tolerance, deep,
+                            out, search, local, nodes, keys, corners, spare, rects, spans),
                 )  # fmt: skip
             inside, begin = not inside, end
         value[i], t[i] = -deep - 0.1 * tolerance, out[0]

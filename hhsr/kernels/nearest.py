@@ -68,8 +68,7 @@ def _settle(blob, ints, tab, code, search, local, corners, spare, rects):
     local[BEST] = search[BEST]
     o, face, a, b, half = facet_cell(ints, leaf, code)
     if (
-        moving
-        or count > 0
+        count > 0
         or not np.float64(tab[o + THIRD]) < np.inf
         or not settle_square(blob, ints, tab, leaf, planes, count, local, face, o, a, b, half, rects)
     ):
@@ -85,8 +84,10 @@ def _settle(blob, ints, tab, code, search, local, corners, spare, rects):
 
 
 @njit(cache=True, error_model="numpy")
-def _seed(blob, ints, search):
-    """Offer surface points on the way down from the facet that is named near the search's point."""
+def seed_point(blob, ints, search):
+    """Offer surface points on the way down from the facet that is named near the search's point; nothing is proven."""
+    if ints[FACET_COUNT] == 0:
+        return
     code = ints[ints[FACET_CODES] + seed_at(blob, ints, search[START], search[START + 1], search[START + 2])]
     leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * (code >> 24) + OWNER_RECORD]
     _, face, a, b, _ = facet_cell(ints, leaf, code)
@@ -108,7 +109,7 @@ def _seed_segment(blob, ints, search, local):
         for q in range(3):
             local[START + q] = search[START + q] + t * search[VECTOR + q]
         local[BEST] = FAR
-        _seed(blob, ints, local)
+        seed_point(blob, ints, local)
         if local[BEST] < FAR:
             distance, t = distance_to(search, local[FOOT], local[FOOT + 1], local[FOOT + 2])
             offer(search, distance, t, local[FOOT], local[FOOT + 1], local[FOOT + 2])
@@ -129,7 +130,7 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
     if moving:
         _seed_segment(blob, ints, search, local)
     else:
-        _seed(blob, ints, search)
+        seed_point(blob, ints, search)
     local[LENGTH2], local[TOLERANCE] = search[LENGTH2], search[TOLERANCE]
     x, y, z = search[START], search[START + 1], search[START + 2]
     dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]

@@ -1,11 +1,14 @@
-"""A cell's surface against a point, by the exact jet of second order at its middle: one quadratic settles most cells.
+"""A cell's surface against a point or a segment, by the exact jet of second order at its middle.
+
+One quadratic settles most cells.
 
 At δ from x₀ = dir₀/W₀ in the chart W = T + E, T linear, |E − ½ δᵀB₀δ| ≤ ½ (kink + third·r/3) |δ|² for |δ| ≤ r. With s the
 surface point, v = q − x₀, A = |v|, U δ = e_a δa + e_b δb − dir₀ (∂W·δ)/W₀ and k = A² − R² + 2 v·dir₀/W₀:
 
     W (|s − q|² − R²) = (W₀ + ∂W·δ)(A² − R²) − 2 v·Uδ + k E + |U δ − (E/W₀) dir₀|²/W
 
-exactly; what is not quadratic in δ is taken at its worst.
+exactly; what is not quadratic in δ is taken at its worst. For a segment the same holds of all vectors' parts across it:
+that is its line's distance, which is the segment's where no end is nearer.
 """
 
 import math
@@ -17,7 +20,7 @@ from hhsr.kernels.cell import direction_of, inverse_radius
 from hhsr.kernels.jet import inverse_radius_bend
 from hhsr.kernels.layout import KINK, THIRD
 from hhsr.kernels.maps import outside_region
-from hhsr.kernels.patch import BEST, FINEST, NODE_ROOM, START, TOLERANCE, distance_to, offer
+from hhsr.kernels.patch import BEST, FINEST, LENGTH2, NODE_ROOM, START, TOLERANCE, VECTOR, distance_to, offer
 
 
 @njit(cache=True, error_model="numpy")
@@ -52,23 +55,14 @@ def least_over_square(c, ca, cb, aa, ab, bb, half):
 
 
 @njit(cache=True, error_model="numpy")
-def square_is_clear(px, py, pz, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third):
-    """Return (clear, δa, δb): no surface over the square about (a, b) lies within `radius` of p (leaf's frame).
+def square_is_clear(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third):
+    """Return (clear, δa, δb): no surface over the square about (a, b) lies within `radius` of the search's segment.
 
-    (w, wa, …): exact jet there. δ: where the quadratic is least, a good guess of the point nearest to p. Never clear
-    where W may vanish on the square.
+    All in the leaf's frame. (w, wa, …): exact jet there. δ: where the quadratic is least, a good guess of the nearest
+    point. Never clear where W may vanish on the square.
     """
     x, y, z = direction_of(face, a, b)
     ell = math.sqrt(x * x + y * y + z * z)
-    vx, vy, vz = px - x / w, py - y / w, pz - z / w
-    away2 = vx * vx + vy * vy + vz * vz
-    if face < 2:
-        va, vb = vy, vz
-    elif face < 4:
-        va, vb = vz, vx
-    else:
-        va, vb = vx, vy
-    along = vx * x + vy * y + vz * z
     fa, fb = wa / w, wb / w
     gaa = 1.0 - 2.0 * fa * a + fa * fa * ell * ell
     gbb = 1.0 - 2.0 * fb * b + fb * fb * ell * ell
@@ -78,27 +72,56 @@ def square_is_clear(px, py, pz, radius, face, a, b, half, w, wa, wb, waa, wab, w
     r = half * math.sqrt(2.0)
     rest = kink + third * r / 3.0
     change = (math.sqrt(wa * wa + wb * wb) + 0.5 * (bend + rest) * r) * r
+    if not change < 0.5 * w:
+        return False, 0.0, 0.0
+    vx, vy, vz = search[START] - x / w, search[START + 1] - y / w, search[START + 2] - z / w
+    if search[LENGTH2] > 0.0:
+        dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
+        over = 1.0 / math.sqrt(search[LENGTH2])
+        nx, ny, nz = dx * over, dy * over, dz * over
+        ahead = -(vx * nx + vy * ny + vz * nz)
+        size = (longest * r + 0.5 * (bend + rest) * r * r * ell / w) / (w - change)
+        if ahead - size > search[LENGTH2] * over:
+            vx, vy, vz = vx + dx, vy + dy, vz + dz  # the end is nearer than the line between
+        elif ahead + size > 0.0:
+            vx, vy, vz = vx + ahead * nx, vy + ahead * ny, vz + ahead * nz
+            if face < 2:
+                na, nb = ny, nz
+            elif face < 4:
+                na, nb = nz, nx
+            else:
+                na, nb = nx, ny
+            cross = nx * x + ny * y + nz * z
+            na, nb = na - fa * cross, nb - fb * cross
+            gaa, gab, gbb = gaa - na * na, gab - na * nb, gbb - nb * nb
+    away2 = vx * vx + vy * vy + vz * vz
+    if face < 2:
+        va, vb = vy, vz
+    elif face < 4:
+        va, vb = vz, vx
+    else:
+        va, vb = vx, vy
+    along = vx * x + vy * y + vz * z
     over = 1.0 / (w + change)
     gap = away2 - radius * radius
     k = gap + 2.0 * along / w
-    less = 0.5 * abs(k) * rest + longest * ell * (bend + rest) * r / (w * max(w - change, 1e-300))
+    less = 0.5 * abs(k) * rest + longest * ell * (bend + rest) * r / (w * (w - change))
     least, da, db = least_over_square(
         w * gap, wa * gap - 2.0 * (va - fa * along), wb * gap - 2.0 * (vb - fb * along),
         gaa * over + 0.5 * k * waa - less, gab * over + 0.5 * k * wab, gbb * over + 0.5 * k * wbb - less, half,
     )  # fmt: skip
     slack = 1e-11 * (w + abs(wa) + abs(wb)) * (away2 + radius * radius)
-    return change < 0.5 * w and least > slack, da, db
+    return least > slack, da, db
 
 
 @njit(cache=True, error_model="numpy")
 def settle_square(blob, ints, tab, leaf, planes, count, search, face, o, a, b, half, rects):
-    """Settle a cell with jets for a point (leaf's frame): offer its nearest point, or prove that it holds none.
+    """Settle a cell with jets (leaf's frame): offer its nearest point, or prove that it holds none.
 
     o: the cell's float32 slot. count: planes of the region that may touch the cell. rects: (NODE_ROOM, 6) scratch.
     Returns whether it could; if not, nothing is proven.
     """
     kink, third = np.float64(tab[o + KINK]), np.float64(tab[o + THIRD])
-    px, py, pz = search[START], search[START + 1], search[START + 2]
     rects[0, 0], rects[0, 1], rects[0, 2] = a, b, half
     depth = 1
     whole = True
@@ -114,17 +137,17 @@ def settle_square(blob, ints, tab, leaf, planes, count, search, face, o, a, b, h
             if radius <= 0.0:
                 return True
             clear, da, db = square_is_clear(
-                px, py, pz, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink if whole else 2.0 * kink, third
+                search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink if whole else 2.0 * kink, third
             )
             if clear or turn == 1:
                 break
             x, y, z = direction_of(face, a + da, b + db)
             m = 1.0 / inverse_radius(blob, ints, leaf, face, a + da, b + db)
             x, y, z = x * m, y * m, z * m
-            distance, _ = distance_to(search, x, y, z)
+            distance, t = distance_to(search, x, y, z)
             if not distance < search[BEST] or outside_region(blob, planes, count, x, y, z, 1e-9):
                 break
-            offer(search, distance, 0.0, x, y, z)
+            offer(search, distance, t, x, y, z)
         whole = False
         if clear or half / w < FINEST:
             continue
