@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from hhsr.kernels.crossing import follow_segment, scratch
+from hhsr.kernels.descent import descend_from
 from hhsr.kernels.foot import foot_in_chart
 from hhsr.kernels.layout import (
     EDGE_COUNT,
@@ -56,6 +57,7 @@ from hhsr.kernels.tree import (
 )
 from hhsr.kernels.voxels import solid_contains
 
+SPANS = 256  # parts of one segment's stretch inside
 SIDE = 1e-6  # mm: how far off a plane its two sides are asked
 
 
@@ -220,9 +222,12 @@ def _highest(px, py, pz, dx, dy, dz, t0, t1, ax, ay, az, bx, by, bz):
 
 
 @njit(cache=True, error_model="numpy")
-def _put_span(spans, s, a, ax, ay, az, b, bx, by, bz):
+def _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, b, bx, by, bz):
+    """Write a span: its ends' t and surface points, the highest bound between them, and its t."""
     spans[s, 0], spans[s, 1], spans[s, 2], spans[s, 3] = a, ax, ay, az
     spans[s, 4], spans[s, 5], spans[s, 6], spans[s, 7] = b, bx, by, bz
+    value2, spans[s, 9] = _highest(px, py, pz, dx, dy, dz, a, b, ax, ay, az, bx, by, bz)
+    spans[s, 8] = math.sqrt(value2)
 
 
 @njit(cache=True, error_model="numpy")
@@ -251,20 +256,28 @@ def deepest(
                 out[0], out[1], out[2], out[3] = t, x, y, z
         o = 4 * k
         spans[0, o], spans[0, o + 1], spans[0, o + 2], spans[0, o + 3] = t, x, y, z
+    _put_span(
+        spans, 0, px, py, pz, dx, dy, dz, t0, spans[0, 1], spans[0, 2], spans[0, 3], t1, spans[0, 5], spans[0, 6],
+        spans[0, 7],
+    )  # fmt: skip
     used = 1
-    high = best
-    while used > 0:
-        used -= 1
-        a, ax, ay, az = spans[used, 0], spans[used, 1], spans[used, 2], spans[used, 3]
-        b, bx, by, bz = spans[used, 4], spans[used, 5], spans[used, 6], spans[used, 7]
-        value2, t = _highest(px, py, pz, dx, dy, dz, a, b, ax, ay, az, bx, by, bz)
-        value = math.sqrt(value2)
-        if value <= best + inner or used + 2 > spans.shape[0]:
-            high = max(high, value)
-            continue
+    while True:
+        s = 0
+        for k in range(1, used):
+            if spans[k, 8] > spans[s, 8]:
+                s = k
+        value, t = spans[s, 8], spans[s, 9]
+        if not value > best + inner or used == spans.shape[0]:
+            return max(best, value)
+        a, ax, ay, az = spans[s, 0], spans[s, 1], spans[s, 2], spans[s, 3]
+        b, bx, by, bz = spans[s, 4], spans[s, 5], spans[s, 6], spans[s, 7]
         set_search(search, px + t * dx, py + t * dy, pz + t * dz, 0.0, 0.0, 0.0, inner)
         if a < t < b:
             seed_point(blob, ints, search)
+            for k in range(2):
+                if not search[BEST] < value - 0.5 * inner:
+                    x, y, z = (ax, ay, az) if k == 0 else (bx, by, bz)
+                    descend_from(blob, ints, x, y, z, search)
         if not search[BEST] < value - 0.5 * inner:
             # Nothing nearer is known, or the bound is highest where a point already found is the nearest known: what is
             # the true distance there?
@@ -272,28 +285,17 @@ def deepest(
             if search[BEST] > best:
                 best = search[BEST]
                 out[0], out[1], out[2], out[3] = t, search[FOOT], search[FOOT + 1], search[FOOT + 2]
-            if not a < t < b:
-                if not search[BEST] < value - 0.5 * inner:
-                    high = max(high, value)
-                    continue
-                if t <= a:
-                    ax, ay, az = search[FOOT], search[FOOT + 1], search[FOOT + 2]
-                else:
-                    bx, by, bz = search[FOOT], search[FOOT + 1], search[FOOT + 2]
-                _put_span(spans, used, a, ax, ay, az, b, bx, by, bz)
-                used += 1
-                continue
+            if value <= best + inner:
+                return max(best, value)
         x, y, z = search[FOOT], search[FOOT + 1], search[FOOT + 2]
-        _put_span(spans, used, a, ax, ay, az, t, x, y, z)
-        _put_span(spans, used + 1, t, x, y, z, b, bx, by, bz)
-        # The higher of the two next.
-        left, _ = _highest(px, py, pz, dx, dy, dz, a, t, ax, ay, az, x, y, z)
-        right, _ = _highest(px, py, pz, dx, dy, dz, t, b, x, y, z, bx, by, bz)
-        if left > right:
-            _put_span(spans, used, t, x, y, z, b, bx, by, bz)
-            _put_span(spans, used + 1, a, ax, ay, az, t, x, y, z)
-        used += 2
-    return high
+        if a < t < b:
+            _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, t, x, y, z)
+            _put_span(spans, used, px, py, pz, dx, dy, dz, t, x, y, z, b, bx, by, bz)
+            used += 1
+        elif t <= a:
+            _put_span(spans, s, px, py, pz, dx, dy, dz, a, x, y, z, b, bx, by, bz)
+        else:
+            _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, b, x, y, z)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -305,7 +307,7 @@ def clearance_many(blob, starts, ends, tolerance, value, t, foot):
     ints, tab = integers(blob), tables(blob)
     search, local, nodes, keys, corners, spare, rects = near_scratch()
     work, slots, pending = scratch()
-    ts, out, spans = np.empty(512), np.empty(4), np.empty((256, 8))
+    ts, out, spans = np.empty(512), np.empty(4), np.empty((SPANS, 10))
     bad = 0
     for i in range(starts.shape[0]):
         ok = True
