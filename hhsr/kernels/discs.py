@@ -29,7 +29,7 @@ def level_sizes(facets: int) -> list[int]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_discs(facets, sizes, blocks):
-    """Fill the blocks (Σ ⌈size/16⌉, DISC_SIZE, 16) float32, lowest level first, from the sorted facets' discs (m, 8)."""
+    """Fill the blocks (Σ ⌈size/16⌉, DISC_SIZE, 16) float32, lowest level first, from the facets' discs (m, 8)."""
     start, span = 0, 1
     for level in range(sizes.shape[0]):
         for i in range(sizes[level]):
@@ -71,12 +71,12 @@ _SHORT, _LONG, _NONE, _ALL = np.float32(1.0 - 1e-6), np.float32(1.0 + 1e-6), np.
 
 
 @njit(cache=True, error_model="numpy")
-def bound_to_point(blocks, i, x, y, z, loose, bounds):
+def bound_to_point(blocks, i, x, y, z, loose, most, bounds):
     """Fill bounds (16,) float32 with lower bounds of the squared distances of a point to the discs of a block.
 
-    blocks: (…, DISC_SIZE, 16) float32.
+    Returns a mask: bit c is set where bound c is no more than `most`. blocks: (…, DISC_SIZE, 16) float32.
     """
-    k = np.uint64(i)
+    k, mask, limit = np.uint64(i), np.uint32(0), np.float32(most) * _LONG
     px, py, pz, e = np.float32(x), np.float32(y), np.float32(z), np.float32(loose)
     for c in range(bounds.shape[0]):
         rx, ry, rz = px - blocks[k, 0, c], py - blocks[k, 1, c], pz - blocks[k, 2, c]
@@ -86,15 +86,14 @@ def bound_to_point(blocks, i, x, y, z, loose, bounds):
         aside = math.sqrt(max(rx * rx + ry * ry + rz * rz - h * h, _NONE)) * _SHORT
         aside = max(aside - (blocks[k, 7, c] + e), _NONE)
         bounds[c] = (along * along + aside * aside) * _SHORT
+        mask |= np.uint32(np.uint32(bounds[c] <= limit) << np.uint32(c))
+    return mask
 
 
 @njit(cache=True, error_model="numpy")
-def bound_to_segment(blocks, i, x, y, z, dx, dy, dz, loose, bounds):
-    """Fill bounds (16,) float32 with lower bounds of the squared distances of p + t·d to the discs of a block.
-
-    By the slab about the disc's plane, and by the ball about the disc.
-    """
-    k = np.uint64(i)
+def bound_to_segment(blocks, i, x, y, z, dx, dy, dz, loose, most, bounds):
+    """Do as `bound_to_point` for p + t·d: by the slab about a disc's plane, and by the ball about the disc."""
+    k, mask, limit = np.uint64(i), np.uint32(0), np.float32(most) * _LONG
     px, py, pz, e = np.float32(x), np.float32(y), np.float32(z), np.float32(loose)
     vx, vy, vz = np.float32(dx), np.float32(dy), np.float32(dz)
     over = np.float32(1.0 / (dx * dx + dy * dy + dz * dz))
@@ -111,3 +110,19 @@ def bound_to_segment(blocks, i, x, y, z, dx, dy, dz, loose, bounds):
         ball = math.sqrt(rx * rx + ry * ry + rz * rz) * _SHORT - math.sqrt(radius * radius + thick * thick)
         low = max(max(slab, ball), _NONE)
         bounds[c] = low * low * _SHORT
+        mask |= np.uint32(np.uint32(bounds[c] <= limit) << np.uint32(c))
+    return mask
+
+
+# The place of a lone bit: the top five bits of its product with de Bruijn's number tell all 32 apart.
+_DE_BRUIJN = np.uint32(0x077CB531)
+_PLACES = np.empty(32, dtype=np.int64)
+for _k in range(32):
+    _PLACES[((0x077CB531 << _k) & 0xFFFFFFFF) >> 27] = _k
+
+
+@njit(cache=True, error_model="numpy")
+def lowest_bit(mask):
+    """Return (c, rest): the place of the lowest bit of a mask that is not 0, and the mask without it."""
+    bit = mask & (~mask + np.uint32(1))
+    return _PLACES[np.uint32(np.uint32(bit * _DE_BRUIJN) >> np.uint32(27))], mask ^ bit

@@ -55,8 +55,9 @@ from hhsr.kernels.tree import (
     owner_of,
     turn_out_of_leaf,
 )
-from hhsr.kernels.voxels import solid_contains
+from hhsr.kernels.voxels import solid_contains, voxel_at
 
+FAR_VOXELS = 3  # away from the surface, a point's own chart proves nothing
 SPANS = 256  # parts of one segment's stretch inside
 SIDE = 1e-6  # mm: how far off a plane its two sides are asked
 
@@ -139,6 +140,8 @@ def _nearest_step(blob, ints, tab, search):
 def _by_chart(blob, ints, tab, search, local):
     """Offer the foot of a point in the chart of its own leaf; return whether that is proven to be the nearest."""
     px, py, pz = search[START], search[START + 1], search[START + 2]
+    if abs(voxel_at(blob, ints, px, py, pz)) > FAR_VOXELS:
+        return False
     owner = owner_of(blob, ints, 0, px, py, pz)
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
     if ints[o + OWNER_KIND] != MODEL:
@@ -355,8 +358,8 @@ def clearance_many(blob, starts, ends, tolerance, value, t, foot):
             if inside and end >= begin:
                 deep = max(
                     deep,
-                    deepest(blob, ints, tab, px, py, pz, dx, dy, dz, begin, end, k > 0, k < count, 0.8 * tolerance, deep,
-                            out, search, local, nodes, keys, corners, spare, rects, spans),
+                    deepest(blob, ints, tab, px, py, pz, dx, dy, dz, begin, end, k > 0, k < count, 0.8 * tolerance,
+                            deep, out, search, local, nodes, keys, corners, spare, rects, spans),
                 )  # fmt: skip
             inside, begin = not inside, end
         value[i], t[i] = -deep - 0.1 * tolerance, out[0]

@@ -125,7 +125,7 @@ def list_facets(blob, owner, leaf, planes, count, codes, discs):
 
 @njit(cache=True, error_model="numpy")
 def _along_curve(i, j, side):
-    """Return the place of (i, j) along Hilbert's curve over a square of `side` (a power of 2): neighbours all the way."""
+    """Return the place of (i, j) along Hilbert's curve over a square of `side`, a power of 2: unbroken."""
     place = 0
     s = side >> 1
     while s > 0:

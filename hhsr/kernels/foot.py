@@ -89,11 +89,11 @@ def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, foot):
             break
         last = move
         ca, cb = na, nb
-    x, y, z = direction_of(face, ca, cb)
-    if last < np.inf or w > 0.0:
+    else:
         w, ga, gb = inverse_radius_jet(blob, ints, leaf, face, ca, cb)
-    if w == 0.0:
-        return np.inf, False
+        if w == 0.0:
+            return np.inf, False
+    x, y, z = direction_of(face, ca, cb)
     x, y, z = x / w, y / w, z / w
     foot[0], foot[1], foot[2] = x, y, z
     distance = math.sqrt((px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2)

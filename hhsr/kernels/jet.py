@@ -1,4 +1,4 @@
-"""Exact value and derivatives of W at one direction, for leaves whose base is an ellipsoid: what a proof starts from."""
+"""Exact W and its derivatives at one direction, for leaves whose base is an ellipsoid: what a proof starts from."""
 
 import math
 
@@ -49,7 +49,7 @@ def inverse_radius_jet(blob, ints, leaf, face, a, b):
 
 @njit(cache=True, error_model="numpy")
 def inverse_radius_bend(blob, ints, leaf, face, a, b):
-    """Return (W, W_a, W_b, W_aa, W_ab, W_bb) at (a, b) by the exact formulas; W is 0 where the scale field is capped."""
+    """Return (W, W_a, W_b, W_aa, W_ab, W_bb) at (a, b) by the exact formulas; W is 0 where the field is capped."""
     length = math.sqrt(1.0 + a * a + b * b)
     q = 1.0 / length
     start = ints[leaf + BLOCKS] + block_of(face, a, b)

@@ -183,8 +183,8 @@ def prove_base(blob, leaf, n, planes, count, models, spans, thickness, bends):
     """Prove the base cells of a leaf.
 
     models: (6, n, n, CELL_SIZE) float32. spans: (6, n, n, 2) range of W. thickness: (6, n, n) mm, how far surface and
-    plane can lie apart in the thickest of a cell's four quarters; 0 where the surface lies outside the leaf's region, so
-    that nothing asks for it. bends: (6, n, n, 2) float32, the bend of each base cell.
+    plane can lie apart in the thickest of a cell's four quarters; 0 where the surface lies outside the leaf's region,
+    so that nothing asks for it. bends: (6, n, n, 2) float32, the bend of each base cell.
     """
     ints = integers(blob)
     half = 1.0 / n

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from hhsr.kernels.descent import descend
-from hhsr.kernels.discs import BLOCK, DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment
+from hhsr.kernels.discs import BLOCK, DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment, lowest_bit
 from hhsr.kernels.facets import facet_cell
 from hhsr.kernels.layout import (
     ERROR,
@@ -67,10 +67,9 @@ def _settle(blob, ints, tab, code, search, local, corners, spare, rects):
         )
     local[BEST] = search[BEST]
     o, face, a, b, half = facet_cell(ints, leaf, code)
-    if (
-        count > 0
-        or not np.float64(tab[o + THIRD]) < np.inf
-        or not settle_square(blob, ints, tab, leaf, planes, count, local, face, o, a, b, half, rects)
+    # A facet that a cut touches is not parted here: beyond the cut no nearness is excluded.
+    if not np.float64(tab[o + THIRD]) < np.inf or not settle_square(
+        blob, ints, tab, leaf, planes, count, local, face, o, a, b, half, count == 0, rects
     ):
         low = cell_bound(
             blob, ints, leaf, planes, count, local, face, a, b, half, np.float64(tab[o + VALUE]),
@@ -96,7 +95,7 @@ def seed_point(blob, ints, search):
 
 @njit(cache=True, error_model="numpy")
 def _seed_segment(blob, ints, search, local):
-    """Offer a surface point near the search's segment: the nearest of a few points', then to and fro between the two."""
+    """Offer a surface point near the search's segment: the nearest of a few points', then to and fro between both."""
     local[LENGTH2], local[TOLERANCE] = 0.0, search[TOLERANCE]
     t = 0.0
     for k in range(SAMPLES + 2):
@@ -129,7 +128,7 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
     local[VECTOR], local[VECTOR + 1], local[VECTOR + 2] = 0.0, 0.0, 0.0
     if moving:
         _seed_segment(blob, ints, search, local)
-    else:
+    elif search[BEST] == FAR:
         seed_point(blob, ints, search)
     local[LENGTH2], local[TOLERANCE] = search[LENGTH2], search[TOLERANCE]
     x, y, z = search[START], search[START + 1], search[START + 2]
@@ -149,13 +148,14 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
         level, i = nodes[depth] >> 40, nodes[depth] & 0xFFFFFFFFFF
         start, size = ints[levels + 1 + 2 * level], ints[levels + 2 + 2 * level]
         if moving:
-            bound_to_segment(blocks, start + i, x, y, z, dx, dy, dz, loose, bounds)
+            mask = bound_to_segment(blocks, start + i, x, y, z, dx, dy, dz, loose, limit * limit, bounds)
         else:
-            bound_to_point(blocks, start + i, x, y, z, loose, bounds)
+            mask = bound_to_point(blocks, start + i, x, y, z, loose, limit * limit, bounds)
         base = depth
-        for c in range(min(WIDE, size - WIDE * i)):
+        while mask != 0:
+            c, mask = lowest_bit(mask)
             low = np.float64(bounds[c])
-            if low > limit * limit:
+            if WIDE * i + c >= size or low > limit * limit:
                 continue
             if level > 0:
                 # Inserted so that the nearest is next.

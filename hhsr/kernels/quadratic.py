@@ -2,8 +2,8 @@
 
 One quadratic settles most cells.
 
-At δ from x₀ = dir₀/W₀ in the chart W = T + E, T linear, |E − ½ δᵀB₀δ| ≤ ½ (kink + third·r/3) |δ|² for |δ| ≤ r. With s the
-surface point, v = q − x₀, A = |v|, U δ = e_a δa + e_b δb − dir₀ (∂W·δ)/W₀ and k = A² − R² + 2 v·dir₀/W₀:
+At δ from x₀ = dir₀/W₀ in the chart W = T + E, T linear, |E − ½ δᵀB₀δ| ≤ ½ (kink + third·r/3) |δ|² for |δ| ≤ r. With s
+the surface point, v = q − x₀, A = |v|, U δ = e_a δa + e_b δb − dir₀ (∂W·δ)/W₀ and k = A² − R² + 2 v·dir₀/W₀:
 
     W (|s − q|² − R²) = (W₀ + ∂W·δ)(A² − R²) − 2 v·Uδ + k E + |U δ − (E/W₀) dir₀|²/W
 
@@ -115,11 +115,11 @@ def square_is_clear(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, 
 
 
 @njit(cache=True, error_model="numpy")
-def settle_square(blob, ints, tab, leaf, planes, count, search, face, o, a, b, half, rects):
+def settle_square(blob, ints, tab, leaf, planes, count, search, face, o, a, b, half, parting, rects):
     """Settle a cell with jets (leaf's frame): offer its nearest point, or prove that it holds none.
 
     o: the cell's float32 slot. count: planes of the region that may touch the cell. rects: (NODE_ROOM, 6) scratch.
-    Returns whether it could; if not, nothing is proven.
+    Returns whether it could, without parting it unless `parting`; if not, nothing is proven.
     """
     kink, third = np.float64(tab[o + KINK]), np.float64(tab[o + THIRD])
     rects[0, 0], rects[0, 1], rects[0, 2] = a, b, half
@@ -151,7 +151,7 @@ def settle_square(blob, ints, tab, leaf, planes, count, search, face, o, a, b, h
         whole = False
         if clear or half / w < FINEST:
             continue
-        if depth + 4 > NODE_ROOM:
+        if not parting or depth + 4 > NODE_ROOM:
             return False
         half *= 0.5
         for corner in range(4):
