@@ -21,7 +21,7 @@ FACET_COUNT, FACET_CODES, FACET_LEVELS = 13, 14, 15
 # Voxels (hhsr.kernels.voxels): integer slot of (nx, ny, nz), float slot of (lowest corner 3, side, 1/side), slot of the
 # bytes; 0 where there are none.
 VOXELS, VOXEL_FRAME, VOXEL_BYTES = 16, 17, 18
-# Seeds (hhsr.kernels.seeds): integer slot of (nx, ny, nz), float slot of (lowest corner 3, 1/side, greatest coordinate),
+# Seeds (hhsr.kernels.seeds): integer slot of (nx, ny, nz), float slot of (lowest corner 3, 1/side, widest coordinate),
 # slot of the int32 numbers of facets.
 SEED_CELLS, SEED_FRAME, SEEDS = 19, 20, 21
 HEADER_SIZE = 22
