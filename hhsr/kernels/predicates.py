@@ -143,12 +143,11 @@ def det2_sign(p, p0, q, q0, j, k):
 @njit(cache=True)
 def cross_sign(p, p0, q, q0):
     """Return the sign of the first component of (p − p0) × (q − q0) that is not 0: the tie rule of both tests below."""
-    s = det2_sign(p, p0, q, q0, 1, 2)
-    if s == 0:
-        s = det2_sign(p, p0, q, q0, 2, 0)
-    if s == 0:
-        s = det2_sign(p, p0, q, q0, 0, 1)
-    return s
+    for turn in range(3):
+        s = det2_sign(p, p0, q, q0, (turn + 1) % 3, (turn + 2) % 3)
+        if s != 0:
+            return s
+    return 0
 
 
 @njit(cache=True)
@@ -179,7 +178,7 @@ def column_side(a, b, point):
         return 1
     if -det > bound:
         return -1
-    sign = det2_sign(a, point, b, point, 0, 1)
+    sign = det2_sign(a, point, b, point, np.int64(0), np.int64(1))  # no literals: each would be compiled anew
     if sign != 0:
         return sign
     if b[1] != a[1]:
