@@ -61,16 +61,9 @@ def one_row(points: ArrayLike) -> FloatArray | None:
     return None
 
 
-def crossings_of_one(first: FloatArray, last: FloatArray, t: FloatArray, begins: bool) -> Crossings:
-    """Return the crossings of one segment (1, 3) → (1, 3) from its t (m,) and whether it starts inside."""
-    count = len(t)
-    return Crossings(
-        np.array([0, count]),
-        t,
-        first + t[:, None] * (last - first) if count else np.empty((0, 3)),
-        np.array([(k % 2 == 0) != begins for k in range(count)], dtype=np.bool_),
-        np.array([True]),
-    )
+def is_point(value: object) -> bool:
+    """Return whether a value is a float64 array (3,): what single calls take without a copy."""
+    return type(value) is np.ndarray and value.shape == (3,) and value.dtype == np.float64
 
 
 def curve(points: ArrayLike) -> FloatArray:

@@ -9,7 +9,7 @@ from numba import njit
 SLACK = 1e-11
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def product(lo, hi, other_lo, other_hi):
     """Return the interval of x·y."""
     a = lo * other_lo
@@ -19,7 +19,7 @@ def product(lo, hi, other_lo, other_hi):
     return min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def signed(lo, hi, sign):
     """Return the interval of sign·x, sign ±1."""
     if sign >= 0.0:
@@ -27,7 +27,7 @@ def signed(lo, hi, sign):
     return -hi, -lo
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def widened(lo, hi):
     """Return the interval rounded outward."""
     slack = SLACK * max(abs(lo), abs(hi))

@@ -10,13 +10,13 @@ from hhsr.kernels.leaf import MAX_SCALE
 from hhsr.kernels.sphere_rbf import gaussian_jet
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def has_jets(ints, leaf):
     """Return whether a leaf's base is an ellipsoid, whose derivatives are closed forms."""
     return ints[leaf + AZIMUTH_COUNT] == 0 and ints[leaf + ELEVATION_COUNT] == 0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def inverse_radius_jet(blob, ints, leaf, face, a, b):
     """Return (W, ∂W/∂a, ∂W/∂b) at (a, b) by the exact formulas; W is 0 where the scale field is capped: no gradient."""
     x, y, z = direction_of(face, a, b)

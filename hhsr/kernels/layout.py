@@ -18,9 +18,9 @@ LOWEST, HIGHEST = 11, 12  # float slots of the box of the solid, tree frame
 # Facets (hhsr.kernels.facets): how many, integer slot of their codes, integer slot of (levels, then start among the
 # float32 tables and number of nodes of each).
 FACET_COUNT, FACET_CODES, FACET_LEVELS = 13, 14, 15
-# Voxels (hhsr.kernels.voxels): integer slot of (nx, ny, nz), float slot of (lowest corner 3, side, 1/side), slot of the
-# bytes; 0 where there are none.
-VOXELS, VOXEL_FRAME, VOXEL_BYTES = 16, 17, 18
+# Voxels (hhsr.kernels.voxels): integer slot of the grid's record, float slot of (lowest corner 3, side, 1/side); 0
+# where there are none.
+VOXELS, VOXEL_FRAME = 16, 17
 HEADER_SIZE = 20
 
 # Nodes: 4 integers (kind, left, right, owner), 8 floats (normal 3, offset, half width).
