@@ -19,6 +19,7 @@ from hhsr.answers import (
     OnInvalid,
     Profile,
     broadcast_segments,
+    crossings_of_one,
     curve,
     is_point,
     marks,
@@ -231,7 +232,7 @@ class Shape:
         resolution = as_float(resolution_mm, "resolution_mm", 1e-6, 1e3)
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-9, 1e3)
         if on_invalid == "raise" and is_point(starts) and is_point(ends):
-            one = self._crossings_of_one(starts, ends, resolution, tolerance)
+            one = crossings_of_one(self._blob, starts, ends, resolution, tolerance)
             if one is not None:
                 return one
         first, last, _ = broadcast_segments(starts, ends)
@@ -266,17 +267,6 @@ class Shape:
         crossing_kernels.place_many(first, last, offsets, begins, t, points, entering)
         return Crossings(offsets, t, points, entering, valid)
 
-    def _crossings_of_one(self, start: Any, end: Any, resolution: float, tolerance: float) -> Crossings | None:
-        """Return the crossings of one segment; None where it is not finite, or has more than there is room for."""
-        offsets, t = np.empty(2, dtype=np.int64), np.empty(16)
-        points, entering = np.empty((16, 3)), np.empty(17, dtype=np.bool_)
-        count = crossing_kernels.cross_one(
-            self._blob, *start.tolist(), *end.tolist(), resolution, tolerance, offsets, t, points, entering
-        )
-        if count < 0:
-            return None
-        return Crossings(offsets, t[:count], points[:count], entering[:count], entering[16:])
-
     def first_crossing(
         self,
         starts: ArrayLike,
@@ -292,7 +282,8 @@ class Shape:
         resolution = as_float(resolution_mm, "resolution_mm", 1e-6, 1e3)
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-9, 1e3)
         if on_invalid == "raise" and is_point(starts) and is_point(ends):
-            one = crossing_kernels.first_one(self._blob, *starts.tolist(), *ends.tolist(), resolution, tolerance)
+            (ax, ay, az), (bx, by, bz) = starts.tolist(), ends.tolist()
+            one = crossing_kernels.first_one(self._blob, ax, ay, az, bx, by, bz, resolution, tolerance)
             if one != -1.0:
                 return one
         first, last, shape = broadcast_segments(starts, ends)

@@ -20,7 +20,7 @@ from hhsr.kernels.region_box import leaf_box, part_box
 from hhsr.kernels.slab_bounds import fill_lobe_spheres
 from hhsr.model import Cut, FloatArray, ModelLeaf, RetainedPart, rotation_matrix
 
-VOXELS_TOTAL = 500_000  # a byte each
+VOXELS_TOTAL = 340_000  # some 5 bytes each, surfels and all
 
 BandTables = tuple[tuple[tuple[FloatArray, FloatArray], ...], ...]
 

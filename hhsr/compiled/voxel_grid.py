@@ -8,7 +8,7 @@ from hhsr.batches import in_parts
 from hhsr.compiled.blob import joined, read_only
 from hhsr.kernels import layout as at
 from hhsr.kernels import voxels as voxel_at
-from hhsr.kernels.surfel import EXTRA, SURFEL_OWNER, SURFEL_SIZE
+from hhsr.kernels.surfel import DETAIL, EXTRA, SURFEL_OWNER, SURFEL_SIZE
 from hhsr.model import FloatArray
 
 
@@ -33,7 +33,7 @@ def voxel_grid(blob: FloatArray, low: FloatArray, side: float, counts: np.ndarra
     first, extra = 0, sum(len(some) for _, _, some, _ in found)
     for i, j, some, more in found:
         bases[i:j] += first
-        some[some[:, SURFEL_OWNER] < 0, EXTRA] += extra
+        some[some[:, DETAIL + SURFEL_OWNER] < 0, DETAIL + EXTRA] += extra
         first, extra = first + len(some), extra + len(more)
     surfels = np.concatenate([some for _, _, some, _ in found] + [more for _, _, _, more in found])
     leaps = np.empty((8, *states.shape), dtype=np.int8)
@@ -43,7 +43,9 @@ def voxel_grid(blob: FloatArray, low: FloatArray, side: float, counts: np.ndarra
     slots[states == 0] = np.arange(len(mixed))
     start = len(blob)
     frame = np.array([*low, side, 1.0 / side])
-    tables: list[np.ndarray] = [frame, leaps, slots, bases, octets, planes, surfels]
+    tables: list[np.ndarray] = [
+        frame, leaps, slots, bases, octets, planes[:, :DETAIL], surfels[:, :DETAIL], surfels[:, DETAIL:],
+    ]  # fmt: skip
     places = np.concatenate([[0], np.cumsum([-(-table.nbytes // 8) for table in tables])]) + start + voxel_at.VOXEL_INTS
     record = np.zeros(voxel_at.VOXEL_INTS, dtype=np.int64)
     record[:3] = counts
@@ -52,6 +54,6 @@ def voxel_grid(blob: FloatArray, low: FloatArray, side: float, counts: np.ndarra
     grown = joined([blob, record, *tables])
     head = grown.view(np.int64)[: at.HEADER_SIZE]
     record = grown.view(np.int64)[start : start + voxel_at.VOXEL_INTS]
-    record[voxel_at.PLANES], record[voxel_at.SURFELS] = 2 * (places[5:7] - head[at.MAP_START])
+    record[voxel_at.BRICK_PLANES : voxel_at.DETAILS + 1] = 2 * (places[5:8] - head[at.MAP_START])
     head[at.VOXELS], head[at.VOXEL_FRAME] = start, places[0]
     return grown

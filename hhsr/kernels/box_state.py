@@ -1,7 +1,6 @@
 """Whether a whole box lies inside or outside the solid: by proof, or not known."""
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.layout import (
     BOX,
@@ -30,19 +29,20 @@ from hhsr.kernels.layout import (
 from hhsr.kernels.maps import level_start, plane_of
 from hhsr.kernels.part import TRIANGLES, part_arrays
 from hhsr.kernels.tree import into_leaf, owner_contains
+from hhsr.kernels.unmanaged import managed, unmanaged
 
 OUT, IN, MIXED = 0, 1, 2
 SPAN = 3  # cells a side that are looked at one by one
 SLACK = 1e-6  # mm that a box is grown by on all sides
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def index_of(x, side):
     """Return the cell, of `side` over [−1, 1], that holds x."""
     return min(max(int((x + 1.0) * 0.5 * side), 0), side - 1)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def _over_cells(ints, tab, leaf, face, q, e, m_hi, a_lo, a_hi, b_lo, b_hi):
     """Return the state of a box over a rectangle of directions of a face, each cell by its linear model."""
     n = ints[leaf + CELLS]
@@ -74,7 +74,7 @@ def _over_cells(ints, tab, leaf, face, q, e, m_hi, a_lo, a_hi, b_lo, b_hi):
     return state
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def directions_of(face, q, e):
     """Return (m_lo, m_hi, a_lo, a_hi, b_lo, b_hi) of the box q ± e (leaf's frame) on a face; m_hi is 0 where it is not.
 
@@ -99,7 +99,7 @@ def directions_of(face, q, e):
     return m_lo, m_hi, a_lo, a_hi, b_lo, b_hi
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def leaf_box_state(blob, ints, tab, leaf, q, e):
     """Return the state of the box q ± e (leaf's frame) of a model leaf."""
     box = ints[leaf + BOX]
@@ -137,7 +137,7 @@ def leaf_box_state(blob, ints, tab, leaf, q, e):
     return state if state >= 0 else MIXED
 
 
-@njit(cache=True, error_model="numpy", _nrt=True)
+@managed
 def _part_box_state(blob, ints, part, q, e, stack):
     """Return the state of a box of a retained part: mixed where it meets the box of any triangle's node."""
     if ints[part + TRIANGLES] == 0:
@@ -160,7 +160,7 @@ def _part_box_state(blob, ints, part, q, e, stack):
     return -1
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def box_state(blob, ints, tab, x, y, z, half, nodes, stack, q, e):
     """Return IN, OUT or MIXED of the cube about (x, y, z), tree frame; nodes, stack, q, e: scratch."""
     half += SLACK + 1e-9 * (abs(x) + abs(y) + abs(z))

@@ -4,7 +4,6 @@ The state at each instant is the owner's; where it changes, inside an owner or a
 """
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.layout import (
     CUT,
@@ -27,9 +26,10 @@ from hhsr.kernels.slab_segment import slab_crossings
 from hhsr.kernels.tree import into_leaf, turn_into_leaf
 from hhsr.kernels.triangle_build import STACK
 from hhsr.kernels.triangles import segment_crossings, sort_crossings
+from hhsr.kernels.unmanaged import managed, unmanaged
 
 
-@njit(cache=True, error_model="numpy", _nrt=True)
+@managed
 def part_crossings(blob, ints, part, px, py, pz, dx, dy, dz, t0, t1, state, out, count):
     """Follow a retained part: the exact crossings of the whole segment, and of them those in [t0, t1]."""
     if ints[part + TRIANGLES] == 0:
@@ -58,7 +58,7 @@ def part_crossings(blob, ints, part, px, py, pz, dx, dy, dz, t0, t1, state, out,
     return state, count
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def owner_crossings(
     blob, ints, tab, owner, px, py, pz, dx, dy, dz, t0, t1, resolution, tolerance, state, out, count, work
 ):
@@ -79,7 +79,7 @@ def owner_crossings(
     )
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def follow_tree(
     blob, ints, tab, root, px, py, pz, dx, dy, dz, begin, end, gap, resolution, tolerance, first, state, out, count,
     work, slots, pending,
@@ -131,7 +131,7 @@ def follow_tree(
     return state, count, False
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def merge_touches(out, count, gap):
     """Drop pairs of crossings closer than `gap`: rounding at the meeting of two proofs. Keeps the parity."""
     if count < 2 or count > out.shape[0]:

@@ -13,6 +13,7 @@ from hhsr.kernels.layout import VOXELS, integers, tables
 from hhsr.kernels.segment import emit
 from hhsr.kernels.stretch import PIECES
 from hhsr.kernels.tree import into_tree
+from hhsr.kernels.unmanaged import unmanaged
 from hhsr.kernels.voxels import solid_contains
 from hhsr.kernels.walk import follow_voxels
 
@@ -26,7 +27,7 @@ def scratch():
     return np.empty((PIECES + 1, 8)), np.empty((SLOTS, 2)), np.empty(SLOTS, dtype=np.int64)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def follow_segment(
     blob, ints, tab, root, px, py, pz, ex, ey, ez, resolution, tolerance, first, out, work, slots, pending
 ):
@@ -49,9 +50,9 @@ def follow_segment(
             px,
             py,
             pz,
-            dx,
-            dy,
-            dz,
+            ex,
+            ey,
+            ez,
             length,
             gap,
             resolution,
@@ -192,7 +193,7 @@ def first_many(blob, starts, ends, resolution, tolerance, out):
     return bad
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def _finite(starts, ends, i):
     for k in range(3):
         if not (math.isfinite(starts[i, k]) and math.isfinite(ends[i, k])):

@@ -11,7 +11,7 @@ from hhsr.kernels.superquadric import superellipse_norm, superquadric_norm
 MAX_SCALE = 0.95
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def leaf_value(x, y, z, half_axes, azimuth, elevation, centres, inverse_extents, weights):
     """Return G = |p|/q(p/|p|) + s(p/|p|) − 1 (PAPER Eq. 3): < 0 inside, 0 on the surface; s is capped at 0.95."""
     length = math.sqrt(x * x + y * y + z * z)
@@ -22,7 +22,7 @@ def leaf_value(x, y, z, half_axes, azimuth, elevation, centres, inverse_extents,
     return norm + min(s, MAX_SCALE) - 1.0
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def leaf_radius(x, y, z, half_axes, azimuth, elevation, centres, inverse_extents, weights):
     """Return ρ = (1 − s)·q in the direction of (x, y, z) ≠ 0, of any length; mm."""
     length = math.sqrt(x * x + y * y + z * z)
@@ -31,7 +31,7 @@ def leaf_radius(x, y, z, half_axes, azimuth, elevation, centres, inverse_extents
     return (1.0 - min(s, MAX_SCALE)) * length / norm
 
 
-@njit(cache=True, _nrt=True)
+@njit(cache=True)
 def leaf_radii(directions, half_axes, azimuth, elevation, centres, inverse_extents, weights):
     """Return (n,) radii for (n, 3) directions in the leaf's frame."""
     out = np.empty(directions.shape[0])
@@ -50,14 +50,14 @@ def leaf_radii(directions, half_axes, azimuth, elevation, centres, inverse_exten
     return out
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def contour_radius(cosine, sine, half_axes, angle, centres, inverse_extent, weights):
     """Return the contour's radius in direction (cos α, sin α); mm."""
     s = scale_on_circle(cosine, sine, centres, inverse_extent, weights)
     return (1.0 - min(s, MAX_SCALE)) / superellipse_norm(cosine, sine, half_axes, angle)
 
 
-@njit(cache=True, _nrt=True)
+@njit(cache=True)
 def contour_radii(angles, half_axes, angle, centres, inverse_extent, weights):
     """Return (n,) radii for (n,) angles α (rad)."""
     out = np.empty(angles.shape[0])

@@ -8,12 +8,14 @@ even number of times.
 import numpy as np
 from numba import njit
 
+from hhsr.kernels.unmanaged import managed
+
 SPLITTER = 134217729.0  # 2^27 + 1
 DET2_BOUND = 3.3306690738754716e-16  # (3 + 16 u) u, u = 2^-53
 DET3_BOUND = 7.771561172376103e-16  # (7 + 56 u) u
 
 
-@njit(cache=True, inline="always", _nrt=False)
+@njit(cache=True, inline="always")
 def two_sum(a, b):
     """Return (s, e) with s = fl(a + b) and s + e = a + b exactly."""
     s = a + b
@@ -21,7 +23,7 @@ def two_sum(a, b):
     return s, (a - (s - bb)) + (b - bb)
 
 
-@njit(cache=True, inline="always", _nrt=False)
+@njit(cache=True, inline="always")
 def two_product(a, b):
     """Return (p, e) with p = fl(a · b) and p + e = a · b exactly (Dekker)."""
     p = a * b
@@ -34,7 +36,7 @@ def two_product(a, b):
     return p, al * bl - (((p - ah * bh) - al * bh) - ah * bl)
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def _grow(total, count, value):
     """Add `value` to the expansion total[:count] without rounding; return its new length."""
     carry = value
@@ -50,14 +52,14 @@ def _grow(total, count, value):
     return kept
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def _sign_of_sum(total, count):
     if count == 0:
         return 0
     return 1 if total[count - 1] > 0.0 else -1
 
 
-@njit(cache=True, _nrt=True)
+@managed
 def _exact_det3(m):
     """Return the sign of the determinant of the (3, 3, 2) matrix of exact sums (value, rounding rest)."""
     total = np.empty(200)
@@ -89,7 +91,7 @@ def _exact_det3(m):
     return _sign_of_sum(total, count)
 
 
-@njit(cache=True, _nrt=True)
+@managed
 def det3_sign(a, b, c, origin):
     """Return the exact sign (−1, 0, 1) of det(a − origin, b − origin, c − origin) of four points (3,)."""
     ax, ay, az = a[0] - origin[0], a[1] - origin[1], a[2] - origin[2]
@@ -112,7 +114,7 @@ def det3_sign(a, b, c, origin):
     return _exact_det3(m)
 
 
-@njit(cache=True, _nrt=True)
+@managed
 def det2_sign(p, p0, q, q0, j, k):
     """Return the exact sign of u_j v_k − u_k v_j with u = p − p0, v = q − q0, of points (3,)."""
     uj, uk, vj, vk = p[j] - p0[j], p[k] - p0[k], q[j] - q0[j], q[k] - q0[k]
@@ -140,7 +142,7 @@ def det2_sign(p, p0, q, q0, j, k):
     return _sign_of_sum(total, count)
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def cross_sign(p, p0, q, q0):
     """Return the sign of the first component of (p − p0) × (q − q0) that is not 0: the tie rule of both tests below."""
     s = det2_sign(p, p0, q, q0, 1, 2)
@@ -151,7 +153,7 @@ def cross_sign(p, p0, q, q0):
     return s
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def line_side(start, end, a, b):
     """Return on which side (±1) of the edge a → b the line start → end passes; 0 only where they are parallel.
 
@@ -161,14 +163,14 @@ def line_side(start, end, a, b):
     return sign if sign != 0 else cross_sign(end, start, b, a)
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def plane_side(a, b, c, point):
     """Return on which side (±1) of the triangle's plane a point lies, 1 where its normal points; 0: no area."""
     sign = det3_sign(b, c, point, a)
     return sign if sign != 0 else cross_sign(b, a, c, a)
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def column_side(a, b, point):
     """Return `line_side` of the line through the point along +z."""
     uj, uk, vj, vk = a[0] - point[0], a[1] - point[1], b[0] - point[0], b[1] - point[1]

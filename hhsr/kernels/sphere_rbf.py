@@ -5,7 +5,7 @@ import math
 from numba import njit
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def wendland_gaussian(h):
     """Return λ = e^(−4h) (1 − h)² for h = d / (1 − cos σ) < 1, else 0."""
     if h >= 1.0:
@@ -14,7 +14,7 @@ def wendland_gaussian(h):
     return math.exp(-4.0 * h) * rest * rest
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def scale_on_sphere(ux, uy, uz, centres, inverse_extents, weights):
     """Return s(u) of a unit direction. centres: (k, 3); inverse_extents: (k,) 1/(1 − cos σ); weights: (k,)."""
     total = 0.0
@@ -25,7 +25,7 @@ def scale_on_sphere(ux, uy, uz, centres, inverse_extents, weights):
     return total
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def scale_on_circle(cosine, sine, centres, inverse_extent, weights):
     """Return s(α) on the circle. centres: (k, 2) cos α_j, sin α_j; one support for all."""
     total = 0.0
@@ -56,7 +56,7 @@ _P0, _P1, _P2, _P3, _P4, _P5, _P6, _P7, _P8, _P9, _P10, _P11 = _POWERS
 _MIDDLE = math.exp(-2.0)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, _nrt=False)
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 def gaussian_sum(cx, cy, cz, inverse_extents, weights, ux, uy, uz):
     """Return Σ w λ(h) of a unit direction over rows (n,) of centres: `scale_on_sphere` at a fifth of its time.
 
@@ -77,7 +77,7 @@ def gaussian_sum(cx, cy, cz, inverse_extents, weights, ux, uy, uz):
     return total
 
 
-@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, _nrt=False)
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 def gaussian_jet(cx, cy, cz, inverse_extents, weights, ux, uy, uz):
     """Return (s, ∂s/∂x, ∂s/∂y, ∂s/∂z) of a unit direction over rows of centres, the sum continued off the sphere.
 
@@ -102,7 +102,7 @@ def gaussian_jet(cx, cy, cz, inverse_extents, weights, ux, uy, uz):
     return total, fx, fy, fz
 
 
-@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, _nrt=False, forceinline=True)
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, forceinline=True)
 def gaussian_along(cx, cy, cz, inverse_extents, weights, ux, uy, uz, vx, vy, vz):
     """Return (s, ds) of a unit direction u over rows of centres: its value, and its change along a tangent vector v."""
     total = slope = 0.0

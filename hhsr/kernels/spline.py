@@ -40,7 +40,7 @@ def _hermite(v0, v1, s0, s1):
     return np.ascontiguousarray(np.stack([v0, s0, 3.0 * (v1 - v0) - 2.0 * s0 - s1, 2.0 * (v0 - v1) + s0 + s1], axis=1))
 
 
-@njit(cache=True, inline="never", _nrt=False)
+@njit(cache=True, inline="never")
 def exponent_and_slope(coefficients, share):
     """Return (ε, dε/dshare) at share ∈ [0, 1] of the knots' range; (1, 0) where there are no knots.
 

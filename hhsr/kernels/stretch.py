@@ -6,17 +6,16 @@ they settle most stretches at once, and one Newton step from there leaves no mor
 
 import math
 
-from numba import njit
-
 from hhsr.kernels.cell import axis_scale, block_of, face_of, norm_at, scale_in_block
 from hhsr.kernels.layout import BLOCK_DATA, BLOCK_ROWS, BLOCKS, HALF_AXES
 from hhsr.kernels.leaf import MAX_SCALE
 from hhsr.kernels.sphere_rbf import gaussian_along
+from hhsr.kernels.unmanaged import inlined, unmanaged
 
 PIECES = 64  # depth of the bisection
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
+@inlined
 def change(state, new, t, gap, out, count):
     """Record a change of state at t, or drop the last where it is within `gap`: a touch; return (state, count).
 
@@ -31,7 +30,7 @@ def change(state, new, t, gap, out, count):
     return state, count
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def excess(blob, ints, leaf, x, y, z):
     """Return F − 1 at a point of the leaf's frame by the exact formula: ≤ 0 inside."""
     length = math.sqrt(x * x + y * y + z * z)
@@ -42,7 +41,7 @@ def excess(blob, ints, leaf, x, y, z):
     return norm_at(blob, ints, leaf, x, y, z) / (1.0 - min(s, MAX_SCALE)) - 1.0
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
+@inlined
 def excess_along(blob, ints, leaf, x, y, z, dx, dy, dz):
     """Return (F − 1, ∂F/∂d) at a point of the frame of a leaf with an ellipsoid for a base, where nothing is capped."""
     inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
@@ -65,7 +64,7 @@ def excess_along(blob, ints, leaf, x, y, z, dx, dy, dz):
     return f - 1.0, ((cx * x * dx + cy * y * dy + cz * z * dz) / norm + f * ds) * d
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def root_in(blob, ints, leaf, px, py, pz, dx, dy, dz, lo, hi, guess, rises, least, most, bend, tolerance):
     """Return t in [lo, hi] where F = 1 on p + t·d (leaf's frame), to the tolerance (of t).
 
@@ -82,7 +81,7 @@ def root_in(blob, ints, leaf, px, py, pz, dx, dy, dz, lo, hi, guess, rises, leas
             f, slope = excess_along(blob, ints, leaf, x, y, z, dx, dy, dz)
             if not rises:
                 f, slope = -f, -slope
-            steep = max(slope - bend * (hi - lo), least)
+            steep = max(slope - bend * (hi - lo), least, 1e-30)
             far = abs(f) / steep
             if 0.5 * bend * far * far <= tolerance * steep:
                 return min(max(t - f / max(slope, steep), lo), hi)
@@ -108,7 +107,7 @@ def root_in(blob, ints, leaf, px, py, pz, dx, dy, dz, lo, hi, guess, rises, leas
     return 0.5 * (lo + hi)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def settle_stretch(
     blob, ints, leaf, px, py, pz, dx, dy, dz, a, b, bend, resolution, tolerance, gap, state, out, count, work
 ):

@@ -7,7 +7,7 @@ from numba import njit
 from hhsr.kernels.spline import exponent_and_slope
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def p_norm(x, y, exponent):
     """Return (x^(2/ε) + y^(2/ε))^(ε/2) of x, y ≥ 0, divided by the larger first: 2/ε reaches 20."""
     large, small = (x, y) if x >= y else (y, x)
@@ -18,7 +18,7 @@ def p_norm(x, y, exponent):
     return large * math.exp(0.5 * exponent * math.log1p(math.exp(math.log(small / large) * (2.0 / exponent))))
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def superquadric_norm(x, y, z, half_axes, azimuth, elevation):
     """Return N(x, y, z), the factor by which the superquadric must grow to reach the point; 0 at the centre.
 
@@ -38,7 +38,7 @@ def superquadric_norm(x, y, z, half_axes, azimuth, elevation):
     return p_norm(p_norm(sx, sy, e2), sz, e1)
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def superellipse_norm(x, y, half_axes, angle):
     """Return the 2-D counterpart: the factor by which the superellipse must grow to reach (x, y)."""
     e = 1.0

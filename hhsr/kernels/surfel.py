@@ -7,7 +7,6 @@ box F is a plane to within what the cells' models prove, and most questions abou
 import math
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.box_state import IN, MIXED, OUT, SLACK, directions_of, index_of, leaf_box_state
 from hhsr.kernels.layout import (
@@ -37,19 +36,24 @@ from hhsr.kernels.layout import (
 )
 from hhsr.kernels.maps import plane_of
 from hhsr.kernels.tree import into_leaf, turn_out_of_leaf
+from hhsr.kernels.unmanaged import unmanaged
 
-# A surfel: over its voxel, in voxel units u from its centre, F − 1 = normal·u + offset ± thick; the gradient of F
-# strays no more than `turn` from the normal; |second derivative of F along a unit vector| ≤ bend (infinite: unknown).
-# A voxel that one cutting plane passes has, as its surfel, owner = −1 − the cut's node, and at EXTRA where the surfels
-# of its two sides lie, left and right; of a side that is proven whole the normal is 0.
-SURFEL_SIZE = 8
+# A surfel: over its voxel, in voxel units u from its centre, F − 1 = thick·(normal·u + offset ± 1), so that the plane
+# decides where |normal·u + offset| > 1; the gradient of F strays no more than `turn` from the plane's; |second
+# derivative of F along a unit vector| ≤ bend (infinite: unknown). The first four numbers lie apart: most need no more.
+# A voxel that one cutting plane passes has no normal (NaN), owner = −1 − the cut's node, and at EXTRA where the surfels
+# of its two sides lie, left and right.
+PLANE_SIZE, DETAIL_SIZE = 4, 4
+SURFEL_SIZE = PLANE_SIZE + DETAIL_SIZE
+NORMAL, OFFSET, DETAIL = 0, 3, 4
+THICK, TURN, BEND, SURFEL_OWNER = 0, 1, 2, 3  # from DETAIL on
 EXTRA = 0
-NORMAL, OFFSET, THICK, TURN, BEND, SURFEL_OWNER = 0, 3, 4, 5, 6, 7
+SURE = 2.0  # offset where a side is proven whole
 MOST_CELLS = 2000  # a box that sweeps more is too near its leaf's centre
 SHALLOW = 0.5  # least ratio of the depths of a box below its face
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def _scan(ints, tab, leaf, face, a_lo, a_hi, b_lo, b_hi, gx, gy, gz, gather, acc):
     """Go over the cells of a rectangle of directions of a face; return how many there are.
 
@@ -79,7 +83,8 @@ def _scan(ints, tab, leaf, face, a_lo, a_hi, b_lo, b_hi, gx, gy, gz, gather, acc
                     count += 1
                     o = ints[leaf + CELL_TABLE] + CELL_SIZE * ((word >> 4) + (p - i * s) * s + r - j * s)
                     a, b = (2 * p + 1) * half - 1.0, (2 * r + 1) * half - 1.0
-                    value, slope_a, slope_b = tab[o + VALUE], tab[o + SLOPE_A], tab[o + SLOPE_B]
+                    value, slope_a = np.float64(tab[o + VALUE]), np.float64(tab[o + SLOPE_A])
+                    slope_b = np.float64(tab[o + SLOPE_B])
                     if gather:
                         x, y, z = plane_of(face, a, b, value, slope_a, slope_b)
                         acc[0], acc[1], acc[2] = min(acc[0], x), min(acc[1], y), min(acc[2], z)
@@ -100,7 +105,7 @@ def _scan(ints, tab, leaf, face, a_lo, a_hi, b_lo, b_hi, gx, gy, gz, gather, acc
     return count
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def prove_plane(ints, tab, leaf, q, e, acc, out):
     """Fill out (8,) with the surfel of the box q ± e of a model leaf, in its frame and mm; return whether there is one.
 
@@ -135,11 +140,12 @@ def prove_plane(ints, tab, leaf, q, e, acc, out):
             bend = max(bend, (1.0 + far_a * far_a + far_b * far_b) * acc[4] / m_lo)
     out[NORMAL], out[NORMAL + 1], out[NORMAL + 2] = gx, gy, gz
     out[OFFSET] = gx * q[0] + gy * q[1] + gz * q[2] + 0.5 * (low + high) - 1.0
-    out[THICK], out[TURN], out[BEND] = 0.5 * (high - low) * (1.0 + 1e-9) + 2e-9, turn * (1.0 + 1e-9), bend
-    return out[THICK] < 1e3 and turn < 1e3
+    thick = 0.5 * (high - low) * (1.0 + 1e-9) + 2e-9
+    out[DETAIL + THICK], out[DETAIL + TURN], out[DETAIL + BEND] = thick, turn * (1.0 + 1e-9), bend
+    return thick < 1e3 and turn < 1e3
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def owner_of_box(blob, ints, node, x, y, z, half):
     """Return the owner, below a node, of the whole cube about (x, y, z), tree frame; −1 − n where cut n passes it."""
     while True:
@@ -157,7 +163,7 @@ def owner_of_box(blob, ints, node, x, y, z, half):
             return -1 - node
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def _prove_side(blob, ints, tab, owner, x, y, z, half, side, q, e, acc, plane, out):
     """Return IN, OUT or MIXED of a voxel in one owner's region, filling out (SURFEL_SIZE,) float32; −1: no surfel."""
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
@@ -168,38 +174,41 @@ def _prove_side(blob, ints, tab, owner, x, y, z, half, side, q, e, acc, plane, o
     g = ints[leaf + FRAME]
     for k in range(3):
         e[k] = half * (abs(blob[g + 3 + k]) + abs(blob[g + 6 + k]) + abs(blob[g + 9 + k]))
-    if not prove_plane(ints, tab, leaf, q, e, acc, plane):
+    state = MIXED
+    if prove_plane(ints, tab, leaf, q, e, acc, plane):
+        gx, gy, gz = turn_out_of_leaf(blob, g, plane[NORMAL], plane[NORMAL + 1], plane[NORMAL + 2])
+        gx, gy, gz, level = gx * side, gy * side, gz * side, plane[OFFSET]
+        steep = abs(gx) + abs(gy) + abs(gz)
+        reach = steep * (half / side)
+        # The numbers are float32, and a segment's place along it is rounded: far less than a millionth of a voxel.
+        thick = (plane[DETAIL + THICK] + 1e-6 * reach + 1e-6 * steep + 1e-6 * abs(level)) * (1.0 + 1e-6)
+        if level - reach > thick:
+            state = OUT
+        elif level + reach < -thick:
+            state = IN
+        elif plane[DETAIL + BEND] == np.inf and thick > steep:
+            return -1
+        out[NORMAL], out[NORMAL + 1], out[NORMAL + 2] = gx / thick, gy / thick, gz / thick
+        out[OFFSET], out[DETAIL + THICK] = level / thick, thick
+        out[DETAIL + TURN] = plane[DETAIL + TURN] * side * (1.0 + 1e-6) + 1e-6 * steep
+        out[DETAIL + BEND] = plane[DETAIL + BEND] * side * side * (1.0 + 1e-6)
+    else:
         state = leaf_box_state(blob, ints, tab, leaf, q, e)
         if state == MIXED:
             return -1
-        plane[:] = 0.0
-        plane[OFFSET] = -1.0 if state == IN else 1.0
-    gx, gy, gz = turn_out_of_leaf(blob, g, plane[NORMAL], plane[NORMAL + 1], plane[NORMAL + 2])
-    gx, gy, gz = gx * side, gy * side, gz * side
-    steep = abs(gx) + abs(gy) + abs(gz)
-    # The voxel's numbers are float32, and a segment's place along it is rounded: far less than a millionth of a voxel.
-    thick = (plane[THICK] + 1e-6 * steep + 1e-7 * abs(plane[OFFSET])) * (1.0 + 1e-6)
-    state = MIXED
-    if plane[OFFSET] - steep * (half / side) > thick:
-        state = OUT
-    elif plane[OFFSET] + steep * (half / side) < -thick:
-        state = IN
-    elif plane[BEND] == np.inf and thick > steep:
-        return -1
     if state != MIXED:
-        gx = gy = gz = thick = plane[TURN] = plane[BEND] = 0.0
-        plane[OFFSET] = -1.0 if state == IN else 1.0
-    out[NORMAL], out[NORMAL + 1], out[NORMAL + 2], out[OFFSET] = gx, gy, gz, plane[OFFSET]
-    out[THICK], out[TURN] = thick, plane[TURN] * side * (1.0 + 1e-6) + 1e-6 * steep
-    out[BEND], out[SURFEL_OWNER] = plane[BEND] * side * side * (1.0 + 1e-6), owner
+        out[:] = 0.0
+        out[OFFSET], out[DETAIL + THICK] = (-SURE if state == IN else SURE), 1.0
+    out[DETAIL + SURFEL_OWNER] = owner
     return state
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def prove_voxel(blob, ints, tab, x, y, z, half, side, q, e, acc, plane, out, left, right):
     """Return IN, OUT or MIXED of the cube about (x, y, z), half a side in mm, by its surfel; −1 where it has none.
 
-    Fills out (SURFEL_SIZE,) float32, in units of `side`, and left and right where a cut passes: owner < 0 then, and EXTRA is to be filled.
+    Fills out (SURFEL_SIZE,) float32, in units of `side`, and left and right where a cut passes: owner < 0 then, and
+    EXTRA is to be filled.
     q, e, acc, plane: scratch.
     """
     half += SLACK + 1e-9 * (abs(x) + abs(y) + abs(z))
@@ -224,6 +233,6 @@ def prove_voxel(blob, ints, tab, x, y, z, half, side, q, e, acc, plane, out, lef
         return -1
     if state == second and state != MIXED:
         return state
-    out[:] = 0.0
-    out[SURFEL_OWNER] = owner
+    out[:] = np.nan
+    out[DETAIL + SURFEL_OWNER] = owner
     return MIXED

@@ -17,7 +17,7 @@ ROUNDING = 1e-15
 TIE = 1e-12
 
 
-@njit(cache=True, inline="always", _nrt=False)
+@njit(cache=True, inline="always")
 def box_distance2(box, x, y, z):
     """Return the squared distance of a point to a box (6,); 0 inside."""
     dx = max(box[0] - x, 0.0, x - box[3])
@@ -26,7 +26,7 @@ def box_distance2(box, x, y, z):
     return dx * dx + dy * dy + dz * dz
 
 
-@njit(cache=True, inline="always", _nrt=False)
+@njit(cache=True, inline="always")
 def _edge_distance2(x, y, z, ux, uy, uz):
     """Return (squared distance, share) of a point to the segment 0 → u."""
     length2 = ux * ux + uy * uy + uz * uz
@@ -35,7 +35,7 @@ def _edge_distance2(x, y, z, ux, uy, uz):
     return dx * dx + dy * dy + dz * dz, t
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def triangle_distance2(corner, px, py, pz):
     """Return (squared distance, v, w); the nearest point of the triangle is a + v (b − a) + w (c − a)."""
     x, y, z = px - corner[0, 0], py - corner[0, 1], pz - corner[0, 2]
@@ -61,7 +61,7 @@ def triangle_distance2(corner, px, py, pz):
     return best, best_v, best_w
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def nearest_triangle(boxes, links, corners, x, y, z, limit2, hint, stack, keys):
     """Return (index in tree order, squared distance, v, w) of the nearest triangle within √limit2; −1 where none.
 
@@ -117,7 +117,7 @@ def nearest_points(boxes, links, corners, order, points, distance, nearest, face
             nearest[i, k] = a + v * (corners[hint, 1, k] - a) + w * (corners[hint, 2, k] - a)
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def inside_parity(boxes, links, corners, point, stack):
     """Return whether the closed triangles hold the point (3,): parity of the exact crossings above it.
 
@@ -162,7 +162,7 @@ def inside_points(boxes, links, corners, points, inside):
         inside[i] = inside_parity(boxes, links, corners, points[i], stack)
 
 
-@njit(cache=True, inline="always", _nrt=False)
+@njit(cache=True, inline="always")
 def segment_meets_box(box, start, inverse, limit):
     """Return the t in [0, limit] where the segment enters the box (6,), or −1; never misses by rounding.
 
@@ -183,7 +183,7 @@ def segment_meets_box(box, start, inverse, limit):
     return t0 * (1.0 - ROUNDING)
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def segment_triangle(corner, start, end):
     """Return (hit, t): 1 where the segment goes out through the triangle, −1 in, 0 misses it; t in [0, 1]."""
     a, b, c = corner[0], corner[1], corner[2]
@@ -202,7 +202,7 @@ def segment_triangle(corner, start, end):
     return after, min(max(t, 0.0), 1.0)
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def invert_direction(start, end, inverse):
     """Fill (3,) 1/(end − start), 0 where it is 0 (or so small that its inverse is not finite)."""
     for k in range(3):
@@ -213,7 +213,7 @@ def invert_direction(start, end, inverse):
             inverse[k] = r if math.isfinite(r) else 0.0
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def segment_crossings(boxes, links, corners, start, end, t, index, out, inverse, stack):
     """Fill t, index (tree order) and out (1 leaving, −1 entering) of all crossings, unsorted; return their number.
 
@@ -244,7 +244,7 @@ def segment_crossings(boxes, links, corners, start, end, t, index, out, inverse,
     return found
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def sort_crossings(t, index, out, count):
     """Sort the first `count` crossings by t, in place.
 
@@ -261,7 +261,7 @@ def sort_crossings(t, index, out, count):
         _alternate(t, index, out, count, -out[0])
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def _alternate(t, index, out, count, want):
     """Exchange tied crossings until out = want, −want, …; return False at the first that no tied one can mend."""
     for i in range(count):
@@ -305,7 +305,7 @@ def all_crossings(boxes, links, corners, order, starts, ends):
     return offsets, all_t[:total].copy(), all_face[:total].copy(), all_out[:total].copy()
 
 
-@njit(cache=True, _nrt=False)
+@njit(cache=True)
 def first_triangle(boxes, links, corners, start, end, inverse, stack, keys):
     """Return (index in tree order, t) of the first crossing of start → end, or (−1, NaN)."""
     invert_direction(start, end, inverse)

@@ -1,26 +1,39 @@
 """A grid of cubes about the solid, proven inside or outside, or given the surface's plane, or left to the formulas.
 
 Voxels come in bricks of 4³. A brick that is proven whole has a leap for each octant of directions: the greatest cube of
-bricks, from it on that way, in which nothing changes. The others have a surfel (`hhsr.kernels.surfel`) that decides most
+bricks, from it on that way, in which nothing changes. The others have a plane (`hhsr.kernels.surfel`) that decides most
 of the brick, and each of their voxels a byte: inside, outside, or the number of its own surfel in the brick.
 """
+
+import math
 
 import numpy as np
 from numba import njit
 
 from hhsr.kernels.box_state import IN, MIXED, OUT, box_state
 from hhsr.kernels.layout import NODE_FLOAT_SIZE, NODE_FLOATS, VOXEL_FRAME, VOXELS, integers, tables
-from hhsr.kernels.surfel import EXTRA, OFFSET, SURFEL_OWNER, SURFEL_SIZE, THICK, prove_voxel
+from hhsr.kernels.surfel import (
+    DETAIL,
+    DETAIL_SIZE,
+    EXTRA,
+    OFFSET,
+    PLANE_SIZE,
+    SURE,
+    SURFEL_OWNER,
+    SURFEL_SIZE,
+    prove_voxel,
+)
 from hhsr.kernels.tree import contains_point
 from hhsr.kernels.triangle_build import STACK
+from hhsr.kernels.unmanaged import inlined, unmanaged
 
 BRICK = 4  # voxels a side
 COARSE = 8  # bricks a side of the first cubes that are tried
 NODES = 256
 # The grid's record, integer slots: bricks along x, y, z; then where its tables begin: octants' leaps (bytes), bricks
 # (32 bits: the number of a brick with voxels; −1 inside, −2 outside), of bricks with voxels the first surfel (32 bits),
-# the 64 bytes, and the brick's own surfel (float32 slot); surfels (float32 slot).
-LEAPS, BRICKS, BASES, BYTES, PLANES, SURFELS, VOXEL_INTS = 3, 4, 5, 6, 7, 8, 9
+# the 64 bytes, and the brick's own plane (float32 slot); of surfels the planes and the details (float32 slots).
+LEAPS, BRICKS, BASES, BYTES, BRICK_PLANES, PLANES, DETAILS, VOXEL_INTS = 3, 4, 5, 6, 7, 8, 9, 10
 INSIDE_BRICK, OUTSIDE_BRICK = -1, -2
 NO_SURFEL, IN_BYTE, OUT_BYTE = 64, 65, 66  # 0 … 63: a surfel of the brick
 LONGEST = 127  # bricks
@@ -60,18 +73,17 @@ def fill_bricks(blob, low, side, first, last, out):
                                 out[a, b, c] = value
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def _prove_brick(blob, ints, tab, low, side, brick, q, e, acc, plane, out, left, right):
-    """Fill out (SURFEL_SIZE,) with a brick's own surfel, in voxel units from its centre; thick without end: none."""
+    """Fill out (SURFEL_SIZE,) with a brick's own surfel, in voxel units from its centre; a plane of zeros: none."""
     x = low[0] + side * BRICK * (brick[0] + 0.5)
     y = low[1] + side * BRICK * (brick[1] + 0.5)
     z = low[2] + side * BRICK * (brick[2] + 0.5)
     state = prove_voxel(blob, ints, tab, x, y, z, 0.5 * BRICK * side, side, q, e, acc, plane, out, left, right)
-    if state != MIXED or out[SURFEL_OWNER] < 0:
+    if state != MIXED or out[DETAIL + SURFEL_OWNER] < 0:
         out[:] = 0.0
-        out[THICK] = np.inf
-        if state == IN or state == OUT:
-            out[OFFSET], out[THICK] = (-1.0 if state == IN else 1.0), 0.0
+    if state == IN or state == OUT:
+        out[OFFSET] = -SURE if state == IN else SURE
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -106,8 +118,8 @@ def fill_voxels(blob, low, side, bricks, octets, bases, planes, surfels, extras)
                         blob, ints, tab, x, y, z, 0.5 * side, side, q, e, acc, plane, surfels[used], left, right
                     )
                     if state == MIXED:
-                        if surfels[used, SURFEL_OWNER] < 0:
-                            surfels[used, EXTRA] = extra
+                        if surfels[used, DETAIL + SURFEL_OWNER] < 0:
+                            surfels[used, DETAIL + EXTRA] = extra
                             extras[extra], extras[extra + 1] = left, right
                             extra += 2
                         byte = used - bases[n]
@@ -162,7 +174,7 @@ def fill_octant(states, octant, out):
                 out[i, j, k] = state * (max(best, 0) + 1)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
+@inlined
 def voxel_state(blob, ints, tab, octets, words, x, y, z):
     """Return 1 inside, −1 outside, 0 not proven, of a point of the tree's frame, by its voxel and its surfel.
 
@@ -177,28 +189,30 @@ def voxel_state(blob, ints, tab, octets, words, x, y, z):
     slot = words[ints[c + BRICKS] + ((i >> 2) * ints[c + 1] + (j >> 2)) * ints[c + 2] + (k >> 2)]
     if slot < 0:
         return 1 if slot == INSIDE_BRICK else -1
-    o = ints[c + PLANES] + SURFEL_SIZE * slot
+    o = ints[c + BRICK_PLANES] + PLANE_SIZE * slot
     level = tab[o] * (u - ((i | 3) - 1)) + tab[o + 1] * (v - ((j | 3) - 1)) + tab[o + 2] * (w - ((k | 3) - 1))
     level += tab[o + OFFSET]
-    if abs(level) > tab[o + THICK]:
+    if abs(level) > 1.0:
         return -1 if level > 0.0 else 1
     byte = octets[ints[c + BYTES] + 64 * slot + (((i & 3) << 4) | ((j & 3) << 2) | (k & 3))]
     if byte > NO_SURFEL:
         return 1 if byte == IN_BYTE else -1
     if byte == NO_SURFEL:
         return 0
-    o = ints[c + SURFELS] + SURFEL_SIZE * (words[ints[c + BASES] + slot] + byte)
-    if tab[o + SURFEL_OWNER] < 0:
-        n = ints[NODE_FLOATS] + NODE_FLOAT_SIZE * (-1 - int(tab[o + SURFEL_OWNER]))
+    number = words[ints[c + BASES] + slot] + byte
+    o = ints[c + PLANES] + PLANE_SIZE * number
+    if math.isnan(tab[o + OFFSET]):
+        d = ints[c + DETAILS] + DETAIL_SIZE * number
+        n = ints[NODE_FLOATS] + NODE_FLOAT_SIZE * (-1 - int(tab[d + SURFEL_OWNER]))
         right = blob[n] * x + blob[n + 1] * y + blob[n + 2] * z - blob[n + 3] >= 0.0
-        o = ints[c + SURFELS] + SURFEL_SIZE * (int(tab[o + EXTRA]) + (1 if right else 0))
+        o = ints[c + PLANES] + PLANE_SIZE * (int(tab[d + EXTRA]) + (1 if right else 0))
     level = tab[o] * (u - (i + 0.5)) + tab[o + 1] * (v - (j + 0.5)) + tab[o + 2] * (w - (k + 0.5)) + tab[o + OFFSET]
-    if level > tab[o + THICK]:
+    if level > 1.0:
         return -1
-    return 1 if level < -tab[o + THICK] else 0
+    return 1 if level < -1.0 else 0
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def solid_contains(blob, ints, tab, root, x, y, z):
     """Return whether the solid of node `root` holds a point of the tree's frame: by its voxel, else by the formulas."""
     if root == 0 and ints[VOXELS] != 0:

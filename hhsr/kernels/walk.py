@@ -8,7 +8,6 @@ a retained part is near, the stretch is clipped down the tree.
 import math
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.cell import leaf_implicit
 from hhsr.kernels.clipped import follow_tree, merge_touches
@@ -24,18 +23,20 @@ from hhsr.kernels.layout import (
     VOXELS,
 )
 from hhsr.kernels.stretch import PIECES, change, root_in, settle_stretch
-from hhsr.kernels.surfel import BEND, EXTRA, OFFSET, SURFEL_OWNER, SURFEL_SIZE, THICK, TURN
+from hhsr.kernels.surfel import BEND, DETAIL_SIZE, EXTRA, OFFSET, PLANE_SIZE, SURFEL_OWNER, THICK, TURN
 from hhsr.kernels.tree import into_leaf, turn_into_leaf
+from hhsr.kernels.unmanaged import inlined, unmanaged
 from hhsr.kernels.voxels import (
     BASES,
     BRICK,
+    BRICK_PLANES,
     BRICKS,
     BYTES,
+    DETAILS,
     IN_BYTE,
     LEAPS,
-    PLANES,
     NO_SURFEL,
-    SURFELS,
+    PLANES,
     solid_contains,
 )
 
@@ -48,7 +49,7 @@ NONE, MONOTONE, BENT, CLIPPED = 0, 1, 2, 3  # kinds of runs: what is proven alon
 RUN, RUN_START, RUN_OWNER, RUN_SIGN, RUN_LEAST, RUN_MOST, RUN_BEND, RUN_GUESS = PIECES, 0, 1, 2, 3, 4, 5, 6
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def _close_run(
     blob, ints, tab, kind, px, py, pz, dx, dy, dz, length, end, new, resolution, tolerance, gap, state, out, count,
     work, slots, pending,
@@ -82,7 +83,7 @@ def _close_run(
     return change(state, new, end, gap, out, count)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def _holds(blob, ints, owner, x, y, z):
     """Return whether a model leaf holds a point of the tree's frame, by the exact formula."""
     leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * owner + OWNER_RECORD]
@@ -90,7 +91,7 @@ def _holds(blob, ints, owner, x, y, z):
     return leaf_implicit(blob, ints, leaf, x, y, z) <= 0.0
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
+@inlined
 def _enter(kind, work, a, b, owner, slope, stray, bend, guess):
     """Add [a, b] of a voxel to the run, or begin one; return the run's kind. Owner −1: a voxel without a surfel."""
     new = CLIPPED if owner < 0 else (MONOTONE if abs(slope) > stray else (BENT if bend < np.inf else CLIPPED))
@@ -111,7 +112,7 @@ def _enter(kind, work, a, b, owner, slope, stray, bend, guess):
     return BENT if work[RUN, RUN_BEND] < np.inf else CLIPPED
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
+@inlined
 def _clip(u, v, size, t0, t1):
     """Return the interval of t in [t0, t1] in which u + t·v lies in [0, size]."""
     if abs(v) < STILL:
@@ -122,16 +123,17 @@ def _clip(u, v, size, t0, t1):
     return max(t0, a), min(t1, b)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@unmanaged
 def follow_voxels(
-    blob, ints, tab, px, py, pz, dx, dy, dz, length, gap, resolution, tolerance, first, out, work, slots, pending
+    blob, ints, tab, px, py, pz, qx, qy, qz, length, gap, resolution, tolerance, first, out, work, slots, pending
 ):
-    """Return (start state, count) of p + t·d (tree's frame), t in [0, 1]: `hhsr.kernels.crossing.follow_segment`."""
+    """Return (start state, count) of p → q (tree's frame): `hhsr.kernels.crossing.follow_segment`."""
+    dx, dy, dz = qx - px, qy - py, qz - pz
     octets, words = blob.view(np.uint8), blob.view(np.int32)
     c, f = ints[VOXELS], ints[VOXEL_FRAME]
     nx, ny, nz = ints[c], ints[c + 1], ints[c + 2]
     bricks, bases, voxels = ints[c + BRICKS], ints[c + BASES], ints[c + BYTES]
-    planes, surfels = ints[c + PLANES], ints[c + SURFELS]
+    brick_planes, planes, details = ints[c + BRICK_PLANES], ints[c + PLANES], ints[c + DETAILS]
     scale = blob[f + 4]
     # All in voxels from here on: u + t·v.
     ux, uy, uz = (px - blob[f]) * scale, (py - blob[f + 1]) * scale, (pz - blob[f + 2]) * scale
@@ -169,10 +171,12 @@ def follow_voxels(
         if first and count > 0 and (t if kind == NONE else work[RUN, RUN_START]) > out[0] + gap:
             return begin, count
         if t >= stop:
+            # The end has its own state: along a cutting plane it may not be the one that the walk came with.
+            holds = stop >= 1.0 and solid_contains(blob, ints, tab, 0, qx, qy, qz)
             if kind == NONE:
+                state, count = change(state, holds, stop, gap, out, count)
                 return begin, count
-            at = stop
-            closing = 1 if stop >= 1.0 and solid_contains(blob, ints, tab, 0, px + dx, py + dy, pz + dz) else 0
+            closing, at = (1 if holds else 0), stop
             continue
         x, y, z = ux + t * vx, uy + t * vy, uz + t * vz
         i, j, k = min(max(int(x), 0), top_x - 1), min(max(int(y), 0), top_y - 1), min(max(int(z), 0), top_z - 1)
@@ -188,16 +192,15 @@ def follow_voxels(
             ez = ((bk + sz * r + oz) << 2) * iz + kz
         else:
             slot = np.int64(words[bricks + brick])
-            o = planes + SURFEL_SIZE * slot
+            o = brick_planes + PLANE_SIZE * slot
             gx, gy, gz = np.float64(tab[o]), np.float64(tab[o + 1]), np.float64(tab[o + 2])
             l0 = gx * (x - ((i | 3) - 1)) + gy * (y - ((j | 3) - 1)) + gz * (z - ((k | 3) - 1)) + tab[o + OFFSET]
-            thick = np.float64(tab[o + THICK])
-            if abs(l0) > thick:
+            if abs(l0) > 1.0:
                 # The brick's own plane decides, up to where the segment comes near it.
                 known = 1 if l0 < 0.0 else 0
                 slope = gx * vx + gy * vy + gz * vz
                 if (l0 > 0.0) != (slope > 0.0) and slope != 0.0:
-                    near = t + (abs(l0) - thick) / abs(slope)
+                    near = t + (abs(l0) - 1.0) / abs(slope)
                 ex = ((bi + sx + ox) << 2) * ix + kx
                 ey = ((bj + sy + oy) << 2) * iy + ky
                 ez = ((bk + sz + oz) << 2) * iz + kz
@@ -206,17 +209,19 @@ def follow_voxels(
                 if byte > NO_SURFEL:
                     known = 1 if byte == IN_BYTE else 0
                 elif byte < NO_SURFEL:
-                    surfel = surfels + SURFEL_SIZE * (np.int64(words[bases + slot]) + byte)
+                    surfel = np.int64(words[bases + slot]) + byte
                 ex = (i + sx + ox) * ix + kx
                 ey = (j + sy + oy) * iy + ky
                 ez = (k + sz + oz) * iz + kz
         end = min(min(ex, ey), min(min(ez, near), stop))
-        owner = -1
+        a, b, after, owner, cut = t, end, UNKNOWN, -1, False
+        slope = stray = bend = guess = 0.0
         if surfel >= 0:
-            owner = int(tab[surfel + SURFEL_OWNER])
-            if owner < 0:
+            if math.isnan(tab[planes + PLANE_SIZE * surfel + OFFSET]):
                 # A cut passes: the side that t is on, and no farther than the cut.
-                n = ints[NODE_FLOATS] + NODE_FLOAT_SIZE * (-1 - owner)
+                cut = True
+                o = details + DETAIL_SIZE * surfel
+                n = ints[NODE_FLOATS] + NODE_FLOAT_SIZE * (-1 - int(tab[o + SURFEL_OWNER]))
                 h = blob[n] * px + blob[n + 1] * py + blob[n + 2] * pz - blob[n + 3]
                 g = blob[n] * dx + blob[n + 1] * dy + blob[n + 2] * dz
                 right = h >= 0.0
@@ -225,37 +230,41 @@ def follow_voxels(
                     right = (t >= meet) == (g > 0.0)
                     if t < meet:
                         end = min(end, meet)
-                surfel = surfels + SURFEL_SIZE * (int(tab[surfel + EXTRA]) + (1 if right else 0))
-                owner = int(tab[surfel + SURFEL_OWNER])
-        a, b, after = t, end, UNKNOWN
-        slope = stray = bend = guess = 0.0
-        if surfel >= 0:
-            gx, gy, gz = np.float64(tab[surfel]), np.float64(tab[surfel + 1]), np.float64(tab[surfel + 2])
+                surfel = int(tab[o + EXTRA]) + (1 if right else 0)
+            o = planes + PLANE_SIZE * surfel
+            gx, gy, gz = np.float64(tab[o]), np.float64(tab[o + 1]), np.float64(tab[o + 2])
             slope = gx * vx + gy * vy + gz * vz
-            thick = np.float64(tab[surfel + THICK])
-            l0 = gx * (x - i - 0.5) + gy * (y - j - 0.5) + gz * (z - k - 0.5) + tab[surfel + OFFSET]
+            l0 = gx * (x - i - 0.5) + gy * (y - j - 0.5) + gz * (z - k - 0.5) + tab[o + OFFSET]
             l1 = l0 + slope * (end - t)
-            if abs(l0) > thick:
+            b = end
+            if abs(l0) > 1.0:
                 known = 1 if l0 < 0.0 else 0
-                a = t + (abs(l0) - thick) / abs(slope)
-            if abs(l1) > thick:
+            if abs(l1) > 1.0:
                 after = 1 if l1 < 0.0 else 0
-                b = end - (abs(l1) - thick) / abs(slope)
-            if known != UNKNOWN and known == after:
+            decided = known != UNKNOWN and known == after
+            if cut or not decided:
+                o = details + DETAIL_SIZE * surfel
+                owner = int(tab[o + SURFEL_OWNER])
+            if decided:
                 surfel = -1
             else:
-                stray, bend = speed * tab[surfel + TURN], speed * speed * tab[surfel + BEND]
-                guess = t - l0 / slope
+                if known != UNKNOWN:
+                    a = t + (abs(l0) - 1.0) / abs(slope)
+                if after != UNKNOWN:
+                    b = end - (abs(l1) - 1.0) / abs(slope)
+                guess = t - l0 / slope if slope != 0.0 else t
+                slope *= np.float64(tab[o + THICK])
+                stray, bend = speed * np.float64(tab[o + TURN]), speed * speed * np.float64(tab[o + BEND])
             # Beyond a cut the run, or the state before it, is another owner's: exact states part the two.
-            foreign = (kind == MONOTONE or kind == BENT) and work[RUN, RUN_OWNER] != owner
-            if foreign or (kind == NONE and known == UNKNOWN and last >= 0 and last != owner):
+            foreign = cut and (kind == MONOTONE or kind == BENT) and work[RUN, RUN_OWNER] != owner
+            if foreign or (cut and kind == NONE and known == UNKNOWN and last >= 0 and last != owner):
                 asked = int(work[RUN, RUN_OWNER]) if foreign else owner
                 holds = _holds(blob, ints, asked, px + t * dx, py + t * dy, pz + t * dz)
                 if foreign:
                     closing, at = (1 if holds else 0), t
                     continue
                 state, count = change(state, holds, t, gap, out, count)
-        last = owner
+        last = owner if cut else -1
         if known != UNKNOWN:
             if kind != NONE:
                 closing, at = known, t
