@@ -2,14 +2,16 @@
 
     python benchmarks/bench_queries.py MESH [--frame LPS] [--max-parameters 989] [--count 20000] [--rounds 5] [--growth]
 
-Ours answers on the fit, the peers on the source mesh. Peers that are not installed are left out, and said so; the extra
-`bench` has them. A rate is the best of the rounds; every round asks every engine once, so that a load on the machine
-falls on all. Rates mean something only side by side in one run.
+Ours answers on the fit, the peers (`benchmarks/peers.py`) on the source mesh. Peers that are not installed are left
+out, and said so; the extra `bench` has them. A rate is the best of the rounds; every round asks every engine once, so
+that a load on the machine falls on all. Rates mean something only side by side in one run. The ratio is to the best
+exact peer; a grid of distances is none. With n threads the process keeps to n cores: not every peer can be told.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,6 +19,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from peers import INEXACT, PEERS
 
 import hhsr
 from hhsr.model import Cut, ModelLeaf, Node, Tree, frozen, leaves
@@ -66,59 +69,6 @@ def sizes(given: dict[str, tuple[np.ndarray, ...]]) -> dict[str, int]:
     }
 
 
-def open3d_queries(vertices: np.ndarray, faces: np.ndarray, given: dict[str, Any], threads: int) -> dict[str, Query]:
-    """Return Open3D's queries (embree)."""
-    import open3d
-
-    scene = open3d.t.geometry.RaycastingScene(nthreads=threads)
-    scene.add_triangles(open3d.core.Tensor(vertices.astype(np.float32)), open3d.core.Tensor(faces.astype(np.uint32)))
-    as_tensor = open3d.core.Tensor
-    uniform, near = (as_tensor(given[k][0].astype(np.float32)) for k in ("uniform", "near"))
-    starts, ends = given["segments"]
-    rays = as_tensor(np.concatenate([starts, ends - starts], axis=1).astype(np.float32))
-    few = 4 * (len(starts) // 20)
-    part_u, part_n = uniform[:few], near[:few]
-    options = {"nthreads": threads}
-    return {
-        "contains, uniform": lambda: scene.compute_occupancy(uniform, **options),
-        "contains, ±2 mm": lambda: scene.compute_occupancy(near, **options),
-        "all crossings": lambda: scene.list_intersections(rays, **options),
-        "first crossing": lambda: scene.cast_rays(rays, **options),
-        "signed distance, uniform": lambda: scene.compute_signed_distance(part_u, **options),
-        "signed distance, ±2 mm": lambda: scene.compute_signed_distance(part_n, **options),
-    }
-
-
-def embreex_queries(vertices: np.ndarray, faces: np.ndarray, given: dict[str, Any], threads: int) -> dict[str, Query]:
-    """Return embreex's queries, through trimesh."""
-    import embreex  # noqa: F401
-    import trimesh
-
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    starts, ends = given["segments"]
-    return {
-        "contains, uniform": lambda: mesh.ray.contains_points(given["uniform"][0]),
-        "contains, ±2 mm": lambda: mesh.ray.contains_points(given["near"][0]),
-        "all crossings": lambda: mesh.ray.intersects_id(starts, ends - starts, multiple_hits=True),
-        "first crossing": lambda: mesh.ray.intersects_first(starts, ends - starts),
-    }
-
-
-def libigl_queries(vertices: np.ndarray, faces: np.ndarray, given: dict[str, Any], threads: int) -> dict[str, Query]:
-    """Return libigl's signed distance (pseudonormals)."""
-    import igl
-
-    few = 4 * (len(given["uniform"][0]) // 20)
-    kind = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-    return {
-        "signed distance, uniform": lambda: igl.signed_distance(given["uniform"][0][:few], vertices, faces, kind),
-        "signed distance, ±2 mm": lambda: igl.signed_distance(given["near"][0][:few], vertices, faces, kind),
-    }
-
-
-PEERS = {"Open3D": open3d_queries, "embreex": embreex_queries, "libigl": libigl_queries}
-
-
 def best_of(engines: dict[str, dict[str, Query]], rounds: int) -> dict[str, dict[str, float]]:
     """Return each engine's least time (s) by query; each round asks every engine once, one after another."""
     least: dict[str, dict[str, float]] = {name: {} for name in engines}
@@ -141,17 +91,20 @@ def single_calls(shape: Shape, given: dict[str, tuple[np.ndarray, ...]], calls: 
     queries: dict[str, Callable[[int], Any]] = {
         "contains": lambda i: shape.contains(points[i]),
         "crossings": lambda i: shape.crossings(starts[i], ends[i]),
+        "first crossing": lambda i: shape.first_crossing(starts[i], ends[i]),
         "signed distance": lambda i: shape.signed_distance(points[i]),
         "capsule clearance": lambda i: shape.clearance(starts[i], ends[i], 1.0),
     }
     for name, query in queries.items():
         spent = np.empty(calls)
+        for i in range(100):
+            query(i % len(points))
         for i in range(calls):
             start = time.perf_counter()
             query(i % len(points))
             spent[i] = time.perf_counter() - start
         median, tail = np.percentile(spent, [50, 99.9]) * 1e6
-        print(f"  one call, {name:20s} median {median:8.1f} µs   p99.9 {tail:9.1f} µs")
+        print(f"  one call, {name:20s} median {median:8.1f} µs   p99.9 {tail:9.1f} µs   {tail / median:5.1f}×")
 
 
 def grown(leaf: ModelLeaf, depth: int, rng: np.random.Generator) -> Node:
@@ -207,8 +160,10 @@ def main() -> None:
     )
     print(f"{compiled.nbytes / 1e6:.1f} MB; the mesh has {len(surface.faces)} triangles")
     given = cases(shape, arguments.count)
+    cores, alone = os.sched_getaffinity(0), {}
     for threads in arguments.threads:
         numba.set_num_threads(threads)
+        os.sched_setaffinity(0, set(range(threads)) & cores or cores)
         engines = {"ours": ours(shape, given)}
         for name, make in PEERS.items():
             try:
@@ -219,9 +174,13 @@ def main() -> None:
         print(f"{threads} thread(s), queries per second:")
         for query, rows in sizes(given).items():
             rates = {name: rows / times[query] for name, times in least.items() if query in times}
-            peers = [rate for name, rate in rates.items() if name != "ours"]
-            ratio = f"ours / best peer = {rates['ours'] / max(peers):.2f}" if peers else "no peer"
+            peers = {name: rate for name, rate in rates.items() if name != "ours" and name not in INEXACT}
+            best = max(peers, key=lambda name: peers[name], default="")
+            ratio = f"{rates['ours'] / peers[best]:.2f}× {best}" if peers else "no peer"
+            ratio += f"   {rates['ours'] / alone[query]:.2f}× one thread" if query in alone else ""
             print(f"  {query:26s} " + "  ".join(f"{n} {r / 1e3:9.1f}k" for n, r in rates.items()) + f"   {ratio}")
+        alone = alone or {query: rows / least["ours"][query] for query, rows in sizes(given).items()}
+    os.sched_setaffinity(0, cores)
     single_calls(shape, given, arguments.calls)
     if arguments.growth:
         found = [node for node in leaves(shape.tree.root) if isinstance(node, ModelLeaf)]

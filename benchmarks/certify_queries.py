@@ -1,10 +1,12 @@
 """The queries of fitted shapes against slow twins, at length: how many answers differ. Exits 1 if any does.
 
-    python benchmarks/certify_queries.py SHAPE.hhsr … [--points 10000000] [--segments 100000] [--distances 10000]
+    python benchmarks/certify_queries.py SHAPE.hhsr … [--points 10000000] [--segments 100000] [--short 100000]
+                                         [--long 500] [--distances 10000]
 
 contains: the voxels' and the maps' answer against the sign of `field`, the formulas alone, on uniform points, points
 within 0.05 mm of the surface and points on cutting planes. crossings: an even count between outside points, on segments
-along axes, through leaf centres and within cutting planes too; between two crossings the state that they claim.
+along axes, through leaf centres and within cutting planes too; between two crossings the state that they claim; on
+segments of at most 2 mm about the surface, and on long ones, the states at steps of 0.002 mm.
 distances: their feet are surface, and no other surface point is nearer. clearances: never above 201 distances.
 """
 
@@ -20,6 +22,7 @@ import hhsr
 from hhsr.model import Cut, ModelLeaf, Node, leaves, rotation_matrix
 
 MESH_MM = 0.02
+STEP_MM, RESOLUTION_STEPS = 0.002, 6
 CHUNK = 1_000_000
 
 
@@ -69,7 +72,39 @@ def segments_of(shape: hhsr.Shape, count: int, rng: np.random.Generator) -> tupl
     return through - far * way, through + far * way
 
 
-def certify(path: str, points: int, segments: int, distances: int, seed: int) -> int:
+def steps_against(shape: hhsr.Shape, starts: np.ndarray, ends: np.ndarray, room: int = 20_000_000) -> int:
+    """Return on how many segments (n, 3) → (n, 3) the states at small steps and the crossings disagree.
+
+    On longer than the resolution; or, where both have as many crossings, on more than a step and the tolerance.
+    """
+    wrong = i = 0
+    length = np.linalg.norm(ends - starts, axis=1)
+    number = np.ceil(length / STEP_MM).astype(int) + 2
+    while i < len(starts):
+        j = max(int(np.searchsorted(np.cumsum(number[i:]), room)), 1) + i
+        some, row = number[i:j], np.repeat(np.arange(i, min(j, len(starts))), number[i:j])
+        share = (np.arange(len(row)) - np.repeat(np.cumsum(some) - some, some)) / (number[row] - 1)
+        states = np.asarray(shape.contains(starts[row] + share[:, None] * (ends - starts)[row]))
+        found = shape.crossings(starts[i:j], ends[i:j])
+        counts = np.diff(found.offsets)
+        keys = 2.0 * np.repeat(np.arange(len(counts)), counts) + found.t
+        passed = np.searchsorted(keys, 2.0 * (row - i) + share) - found.offsets[row - i]
+        begins = np.asarray(shape.contains(starts[i:j]))
+        apart = states != (begins[row - i] ^ (passed % 2 == 1))
+        flips = np.bincount(
+            row[1:] - i, weights=(states[1:] != states[:-1]) & (row[1:] == row[:-1]), minlength=len(counts)
+        )
+        # The length of each stretch of disagreement, in steps.
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], apart, [False]]).astype(int)))
+        first, steps = edges[::2], edges[1::2] - edges[::2]
+        same = (counts == flips)[row[first] - i]
+        bad = (steps > RESOLUTION_STEPS) | (same & (steps > 2))
+        wrong += len(np.unique(row[first][bad]))
+        i = j
+    return wrong
+
+
+def certify(path: str, points: int, segments: int, short: int, long: int, distances: int, seed: int) -> int:
     """Print one line for each query and return how many answers are wrong."""
     shape, rng = hhsr.load(path), np.random.default_rng(seed)
     mesh = shape.mesh(MESH_MM)
@@ -93,6 +128,15 @@ def certify(path: str, points: int, segments: int, distances: int, seed: int) ->
     at = (starts[row[1:][same]] + middle[:, None] * (ends - starts)[row[1:][same]])[wide]
     false = int(((shape.field(at) <= 0.0) != found.entering[:-1][same][wide]).sum())
     print(f"  crossings, {segments} segments, {len(found.t)} crossings: {odd} odd, {false} stretches of a wrong state")
+    middle = surface[rng.integers(len(surface), size=short)] + rng.normal(size=(short, 3)) * 0.3
+    way = rng.normal(size=(short, 3))
+    way *= rng.uniform(0.0, 1.0, (short, 1)) / np.linalg.norm(way, axis=1)[:, None]
+    missed = steps_against(shape, middle - way, middle + way)
+    starts, ends = segments_of(shape, 2 * long, rng)  # the second half lies in cutting planes, in part
+    missed_long = steps_against(shape, starts[:long], ends[:long])
+    print(
+        f"  against steps of {STEP_MM} mm: {missed} of {short} short segments differ, {missed_long} of {long} long ones"
+    )
     # A distance is right if its foot is on the surface, and no other surface point (feet of points near it) is nearer.
     exact = shape.closest_point(surface[rng.integers(len(surface), size=10 * distances)])[0]
     low, high = shape.bounds
@@ -116,7 +160,7 @@ def certify(path: str, points: int, segments: int, distances: int, seed: int) ->
     step = np.linalg.norm(b - a, axis=1) / 400.0
     optimistic, low_by = int((clear > signed + 1e-9 + 0.01).sum()), int((clear < signed - step - 0.0201).sum())
     print(f"  clearance, {len(a)} segments: {optimistic} optimistic, {low_by} too low")
-    return wrong + odd + false + bad + optimistic + low_by
+    return wrong + odd + false + missed + missed_long + bad + optimistic + low_by
 
 
 def main() -> None:
@@ -125,10 +169,13 @@ def main() -> None:
     parser.add_argument("shapes", nargs="+")
     parser.add_argument("--points", type=int, default=10_000_000)
     parser.add_argument("--segments", type=int, default=100_000)
+    parser.add_argument("--short", type=int, default=100_000)
+    parser.add_argument("--long", type=int, default=500)
     parser.add_argument("--distances", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    sys.exit(1 if sum(certify(p, args.points, args.segments, args.distances, args.seed) for p in args.shapes) else 0)
+    how_many = args.points, args.segments, args.short, args.long, args.distances
+    sys.exit(1 if sum(certify(path, *how_many, args.seed) for path in args.shapes) else 0)
 
 
 if __name__ == "__main__":

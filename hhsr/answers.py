@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hhsr.check import as_points
 from hhsr.errors import InputError
+from hhsr.kernels.crossing import cross_one
 from hhsr.model import FloatArray, IntArray
 
 OnInvalid = Literal["raise", "mark"]
+ROOM = 16  # crossings of a single segment
 
 
 class Crossings(NamedTuple):
@@ -61,16 +63,25 @@ def one_row(points: ArrayLike) -> FloatArray | None:
     return None
 
 
-def crossings_of_one(first: FloatArray, last: FloatArray, t: FloatArray, begins: bool) -> Crossings:
-    """Return the crossings of one segment (1, 3) → (1, 3) from its t (m,) and whether it starts inside."""
-    count = len(t)
-    return Crossings(
-        np.array([0, count]),
-        t,
-        first + t[:, None] * (last - first) if count else np.empty((0, 3)),
-        np.array([(k % 2 == 0) != begins for k in range(count)], dtype=np.bool_),
-        np.array([True]),
-    )
+def is_point(value: object) -> TypeGuard[FloatArray]:
+    """Return whether a value is a float64 array (3,): what single calls take without a copy."""
+    return type(value) is np.ndarray and value.shape == (3,) and value.dtype == np.float64
+
+
+def crossings_of_one(
+    blob: FloatArray, start: FloatArray, end: FloatArray, resolution: float, tolerance: float
+) -> Crossings | None:
+    """Return the crossings of one segment (3,) → (3,); None where it is not finite, or has more than there is room for.
+
+    What the tuple holds is cut from four arrays that one call fills: half of a single call's time would go into more.
+    """
+    offsets, t = np.empty(2, dtype=np.int64), np.empty(ROOM)
+    points, entering = np.empty((ROOM, 3)), np.empty(ROOM + 1, dtype=np.bool_)
+    (ax, ay, az), (bx, by, bz) = start.tolist(), end.tolist()
+    count = cross_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance, offsets, t, points, entering)
+    if count < 0:
+        return None
+    return Crossings(offsets, t[:count], points[:count], entering[:count], entering[ROOM:])
 
 
 def curve(points: ArrayLike) -> FloatArray:

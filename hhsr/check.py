@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -43,13 +44,13 @@ def require_finite(points: FloatArray, name: str) -> None:
         )
 
 
-def as_float(value: Any, name: str, low: float = -np.inf, high: float = np.inf) -> float:
+def as_float(value: Any, name: str, low: float = -math.inf, high: float = math.inf) -> float:
     """Return `value` as a finite float within [low, high]; raise InputError otherwise."""
     try:
         number = float(value)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: got {value!r}, expected a number") from error
-    if not (np.isfinite(number) and low <= number <= high):
+    if not (math.isfinite(number) and low <= number <= high):
         raise InputError(f"{name}: got {number}, expected a finite number in [{low}, {high}]")
     return number
 

@@ -21,6 +21,7 @@ from hhsr.answers import (
     broadcast_segments,
     crossings_of_one,
     curve,
+    is_point,
     marks,
     one_row,
     scalar,
@@ -232,11 +233,10 @@ class Shape:
         """
         resolution = as_float(resolution_mm, "resolution_mm", 1e-6, 1e3)
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-9, 1e3)
-        if (start := one_row(starts)) is not None and (end := one_row(ends)) is not None and on_invalid == "raise":
-            number, inside, t = np.empty(1, dtype=np.int64), np.empty(1, dtype=np.bool_), np.empty(64)
-            done, used = crossing_kernels.cross_many(self._blob, start, end, resolution, tolerance, number, inside, t)
-            if done == 1 and number[0] >= 0:
-                return crossings_of_one(start, end, t[:used], bool(inside[0]))
+        if on_invalid == "raise" and is_point(starts) and is_point(ends):
+            one = crossings_of_one(self._blob, starts, ends, resolution, tolerance)
+            if one is not None:
+                return one
         first, last, _ = broadcast_segments(starts, ends)
         counts, begins = np.empty(len(first), dtype=np.int64), np.empty(len(first), dtype=np.bool_)
         blob = self._blob
@@ -263,11 +263,10 @@ class Shape:
                 require_finite(first, "starts")
                 require_finite(last, "ends")
             counts = np.where(valid, counts, 0)
-        offsets = np.concatenate([[0], np.cumsum(counts)])
-        row = np.repeat(np.arange(len(first)), counts)
-        order = np.arange(len(t)) - offsets[row]
-        entering = (order % 2 == 0) != begins[row]
-        points = first[row] + t[:, None] * (last[row] - first[row])
+        offsets = np.zeros(len(first) + 1, dtype=np.int64)
+        np.cumsum(counts, out=offsets[1:])
+        points, entering = np.empty((len(t), 3)), np.empty(len(t), dtype=np.bool_)
+        crossing_kernels.place_many(first, last, offsets, begins, t, points, entering)
         return Crossings(offsets, t, points, entering, valid)
 
     def first_crossing(
@@ -282,10 +281,15 @@ class Shape:
 
         With on_invalid="mark": (t, valid), valid (...) False where a segment is not finite.
         """
-        first, last, shape = broadcast_segments(starts, ends)
-        mark = marks(on_invalid)
         resolution = as_float(resolution_mm, "resolution_mm", 1e-6, 1e3)
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-9, 1e3)
+        if on_invalid == "raise" and is_point(starts) and is_point(ends):
+            (ax, ay, az), (bx, by, bz) = starts.tolist(), ends.tolist()
+            one = crossing_kernels.first_one(self._blob, ax, ay, az, bx, by, bz, resolution, tolerance)
+            if one != -1.0:
+                return one
+        first, last, shape = broadcast_segments(starts, ends)
+        mark = marks(on_invalid)
         out = np.empty(len(first))
         blob = self._blob
         bad = sum(

@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from hhsr.compiled.proofs import BandTables, Proofs, read_only
+from hhsr.compiled.blob import read_only
+from hhsr.compiled.proofs import BandTables, Proofs
 from hhsr.compiled.records import pose_arrays
 from hhsr.kernels import layout as at
 from hhsr.model import FloatArray, Tree, frozen, rotation_matrix

@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hhsr.compiled.blob import appended, read_only
 from hhsr.compiled.edges import straight_edges
 from hhsr.compiled.leaf_maps import fill_leaf_maps
 from hhsr.compiled.records import Owner, Records
+from hhsr.compiled.voxel_grid import voxel_grid
 from hhsr.kernels import layout as at
 from hhsr.kernels import slab as slab_at
+from hhsr.kernels import voxels as voxel_at
 from hhsr.kernels.crossing import first_exits
 from hhsr.kernels.discs import DISC_SIZE, WIDE, fill_discs, level_sizes
 from hhsr.kernels.facets import list_facets, place_facets
 from hhsr.kernels.region_box import leaf_box, part_box
 from hhsr.kernels.seeds import fill_seeds
 from hhsr.kernels.slab_bounds import fill_lobe_spheres
-from hhsr.kernels.voxels import fill_leaps, fill_voxels
 from hhsr.model import Cut, FloatArray, ModelLeaf, RetainedPart, rotation_matrix
 
-VOXELS_TOTAL = 500_000  # a byte each
+VOXELS_TOTAL = 340_000  # some 5 bytes each, surfels and all
 SEEDS_TOTAL = 60_000  # four bytes each
 EMPTY = 1e15  # mm: where a block has no disc
 
@@ -200,15 +200,8 @@ class Proofs(Records):
         side = float((np.prod(extent) / VOXELS_TOTAL) ** (1.0 / 3.0))
         side = max(side, float(extent.max()) / 1000.0)
         low = low - 0.5 * side
-        counts = np.ceil((high - low) / side + 0.5).astype(np.int64)
-        voxels = np.empty(tuple(int(c) for c in counts), dtype=np.int8)
-        fill_voxels(read_only(blob), low, side, counts, voxels)
-        fill_leaps(voxels)
-        start = len(blob)
-        grown = appended(appended(blob, np.concatenate([counts, [0]])), np.array([*low, side, 1.0 / side]))
-        head = self.header(grown)
-        head[at.VOXELS], head[at.VOXEL_FRAME], head[at.VOXEL_BYTES] = start, start + 4, start + 9
-        return appended(grown, voxels)
+        counts = np.ceil(((high - low) / side + 0.5) / voxel_at.BRICK).astype(np.int64)
+        return voxel_grid(blob, low, side, counts)
 
     def bounds(self, blob_view: FloatArray, rotation: FloatArray, shift: FloatArray) -> FloatArray:
         """Return (2, 3) the box of the solid after a rigid motion: of its patches and straight edges."""
@@ -227,19 +220,3 @@ def _union(boxes: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
         if box[0] <= box[3]:
             low, high = np.minimum(low, box[:3]), np.maximum(high, box[3:])
     return low, high
-
-
-def read_only(blob: FloatArray) -> FloatArray:
-    """Return a view of the blob as the kernels take it: one signature for all."""
-    view = blob.view()
-    view.setflags(write=False)
-    return view
-
-
-def appended(blob: FloatArray, table: NDArray[Any]) -> FloatArray:
-    """Return the blob with a table of any numbers behind it."""
-    words = -(-table.nbytes // 8)
-    grown = np.zeros(len(blob) + words)
-    grown[: len(blob)] = blob
-    grown[len(blob) :].view(table.dtype)[: table.size] = table.ravel()
-    return grown

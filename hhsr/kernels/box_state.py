@@ -1,7 +1,6 @@
 """Whether a whole box lies inside or outside the solid: by proof, or not known."""
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.layout import (
     BOX,
@@ -30,29 +29,31 @@ from hhsr.kernels.layout import (
 from hhsr.kernels.maps import level_start, plane_of
 from hhsr.kernels.part import TRIANGLES, part_arrays
 from hhsr.kernels.tree import into_leaf, owner_contains
+from hhsr.kernels.unmanaged import managed, unmanaged
 
 OUT, IN, MIXED = 0, 1, 2
 SPAN = 3  # cells a side that are looked at one by one
 SLACK = 1e-6  # mm that a box is grown by on all sides
 
 
-@njit(cache=True, error_model="numpy")
-def _index(x, side):
+@unmanaged
+def index_of(x, side):
+    """Return the cell, of `side` over [−1, 1], that holds x."""
     return min(max(int((x + 1.0) * 0.5 * side), 0), side - 1)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _over_cells(ints, tab, leaf, face, q, e, m_hi, a_lo, a_hi, b_lo, b_hi):
     """Return the state of a box over a rectangle of directions of a face, each cell by its linear model."""
     n = ints[leaf + CELLS]
     state = -1
-    for i in range(_index(a_lo, n), _index(a_hi, n) + 1):
-        for j in range(_index(b_lo, n), _index(b_hi, n) + 1):
+    for i in range(index_of(a_lo, n), index_of(a_hi, n) + 1):
+        for j in range(index_of(b_lo, n), index_of(b_hi, n) + 1):
             word = ints[ints[leaf + PARTING] + (face * n + i) * n + j]
             s = 1 << (word & 7)
             side = n * s
-            p0, p1 = max(_index(a_lo, side), i * s), min(_index(a_hi, side), i * s + s - 1)
-            q0, q1 = max(_index(b_lo, side), j * s), min(_index(b_hi, side), j * s + s - 1)
+            p0, p1 = max(index_of(a_lo, side), i * s), min(index_of(a_hi, side), i * s + s - 1)
+            q0, q1 = max(index_of(b_lo, side), j * s), min(index_of(b_hi, side), j * s + s - 1)
             for p in range(p0, p1 + 1):
                 for r in range(q0, q1 + 1):
                     o = ints[leaf + CELL_TABLE] + CELL_SIZE * ((word >> 4) + (p - i * s) * s + r - j * s)
@@ -73,7 +74,32 @@ def _over_cells(ints, tab, leaf, face, q, e, m_hi, a_lo, a_hi, b_lo, b_hi):
     return state
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
+def directions_of(face, q, e):
+    """Return (m_lo, m_hi, a_lo, a_hi, b_lo, b_hi) of the box q ± e (leaf's frame) on a face; m_hi is 0 where it is not.
+
+    m: along the face's axis. a, b: its directions.
+    """
+    k = face // 2
+    ka, kb = (k + 1) % 3, (k + 2) % 3
+    m = q[k] if face % 2 == 0 else -q[k]
+    m_hi = m + e[k]
+    least_a, least_b = max(abs(q[ka]) - e[ka], 0.0), max(abs(q[kb]) - e[kb], 0.0)
+    if m_hi <= 0.0 or least_a > m_hi or least_b > m_hi:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    m_lo = max(m - e[k], least_a, least_b, 1e-9)
+    lo, hi = q[ka] - e[ka], q[ka] + e[ka]
+    a_lo = max(lo / (m_hi if lo >= 0.0 else m_lo), -1.0)
+    a_hi = min(hi / (m_lo if hi >= 0.0 else m_hi), 1.0)
+    lo, hi = q[kb] - e[kb], q[kb] + e[kb]
+    b_lo = max(lo / (m_hi if lo >= 0.0 else m_lo), -1.0)
+    b_hi = min(hi / (m_lo if hi >= 0.0 else m_hi), 1.0)
+    if a_lo > 1.0 or b_lo > 1.0 or a_hi < -1.0 or b_hi < -1.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    return m_lo, m_hi, a_lo, a_hi, b_lo, b_hi
+
+
+@unmanaged
 def leaf_box_state(blob, ints, tab, leaf, q, e):
     """Return the state of the box q ± e (leaf's frame) of a model leaf."""
     box = ints[leaf + BOX]
@@ -86,29 +112,16 @@ def leaf_box_state(blob, ints, tab, leaf, q, e):
     n = ints[leaf + CELLS]
     state = -1
     for face in range(6):
-        k = face // 2
-        ka, kb = (k + 1) % 3, (k + 2) % 3
-        m = q[k] if face % 2 == 0 else -q[k]
-        m_hi = m + e[k]
-        least_a, least_b = max(abs(q[ka]) - e[ka], 0.0), max(abs(q[kb]) - e[kb], 0.0)
-        if m_hi <= 0.0 or least_a > m_hi or least_b > m_hi:
-            continue
-        m_lo = max(m - e[k], least_a, least_b, 1e-9)
-        lo, hi = q[ka] - e[ka], q[ka] + e[ka]
-        a_lo = max(lo / (m_hi if lo >= 0.0 else m_lo), -1.0)
-        a_hi = min(hi / (m_lo if hi >= 0.0 else m_hi), 1.0)
-        lo, hi = q[kb] - e[kb], q[kb] + e[kb]
-        b_lo = max(lo / (m_hi if lo >= 0.0 else m_lo), -1.0)
-        b_hi = min(hi / (m_lo if hi >= 0.0 else m_hi), 1.0)
-        if a_lo > 1.0 or b_lo > 1.0 or a_hi < -1.0 or b_hi < -1.0:
+        m_lo, m_hi, a_lo, a_hi, b_lo, b_hi = directions_of(face, q, e)
+        if m_hi <= 0.0:
             continue
         side = n
         while side > 1 and max(a_hi - a_lo, b_hi - b_lo) * side > 2.0 * SPAN:
             side //= 2
         base = ints[leaf + RANGE_TABLE] + 2 * (level_start(n, side) + face * side * side)
         w_lo, w_hi = np.float32(1e30), np.float32(0.0)
-        for i in range(_index(a_lo, side), _index(a_hi, side) + 1):
-            for j in range(_index(b_lo, side), _index(b_hi, side) + 1):
+        for i in range(index_of(a_lo, side), index_of(a_hi, side) + 1):
+            for j in range(index_of(b_lo, side), index_of(b_hi, side) + 1):
                 w_lo, w_hi = min(w_lo, tab[base + 2 * (i * side + j)]), max(w_hi, tab[base + 2 * (i * side + j) + 1])
         if m_hi * w_hi < 1.0 - 1e-9:
             new = IN
@@ -124,7 +137,7 @@ def leaf_box_state(blob, ints, tab, leaf, q, e):
     return state if state >= 0 else MIXED
 
 
-@njit(cache=True, error_model="numpy")
+@managed
 def _part_box_state(blob, ints, part, q, e, stack):
     """Return the state of a box of a retained part: mixed where it meets the box of any triangle's node."""
     if ints[part + TRIANGLES] == 0:
@@ -147,7 +160,7 @@ def _part_box_state(blob, ints, part, q, e, stack):
     return -1
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def box_state(blob, ints, tab, x, y, z, half, nodes, stack, q, e):
     """Return IN, OUT or MIXED of the cube about (x, y, z), tree frame; nodes, stack, q, e: scratch."""
     half += SLACK + 1e-9 * (abs(x) + abs(y) + abs(z))

@@ -7,8 +7,6 @@ stay straight and the surface is a height field (DESIGN §4).
 
 import math
 
-from numba import njit
-
 from hhsr.kernels.interval import product, widened
 from hhsr.kernels.layout import (
     AZIMUTH,
@@ -25,11 +23,12 @@ from hhsr.kernels.leaf import MAX_SCALE
 from hhsr.kernels.norm_bounds import norm_range
 from hhsr.kernels.sphere_rbf import gaussian_sum
 from hhsr.kernels.superquadric import superquadric_norm
+from hhsr.kernels.unmanaged import unmanaged
 
 BORDER = math.exp(-4.0)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def face_of(x, y, z):
     """Return (face, a, b, m) of a point that is not the centre: face 2k for the positive major axis k, 2k + 1 else."""
     ux, uy, uz = abs(x), abs(y), abs(z)
@@ -40,7 +39,7 @@ def face_of(x, y, z):
     return (4 if z >= 0.0 else 5), x / uz, y / uz, uz
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def direction_of(face, a, b):
     """Return the direction (x, y, z), of |·|∞ = 1, that belongs to (a, b) on a face."""
     m = 1.0 if face % 2 == 0 else -1.0
@@ -51,7 +50,7 @@ def direction_of(face, a, b):
     return a, b, m
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def chart_of(face, x, y, z):
     """Return (a, b, m) of a point on a given face: minor coordinates over the major one, and the major one."""
     if face < 2:
@@ -64,7 +63,7 @@ def chart_of(face, x, y, z):
     return x / m, y / m, m
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def block_of(face, a, b):
     """Return the index of the block of directions that holds (a, b)."""
     half = 0.5 * BLOCKS_PER_SIDE
@@ -73,7 +72,7 @@ def block_of(face, a, b):
     return (face * BLOCKS_PER_SIDE + i) * BLOCKS_PER_SIDE + j
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def scale_in_block(blob, ints, leaf, block, ux, uy, uz):
     """Return s(u), summed over the centres of the block."""
     start = ints[leaf + BLOCKS] + block
@@ -85,7 +84,7 @@ def scale_in_block(blob, ints, leaf, block, ux, uy, uz):
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def norm_at(blob, ints, leaf, x, y, z):
     """Return the superquadric's norm N of a leaf at (x, y, z)."""
     n, m = ints[leaf + AZIMUTH_COUNT], ints[leaf + ELEVATION_COUNT]
@@ -100,7 +99,7 @@ def norm_at(blob, ints, leaf, x, y, z):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def leaf_implicit(blob, ints, leaf, x, y, z):
     """Return G(p) = N(p) + s(p/|p|) − 1 in the leaf's frame: ≤ 0 inside. The exact formula behind every answer."""
     length = math.sqrt(x * x + y * y + z * z)
@@ -111,7 +110,7 @@ def leaf_implicit(blob, ints, leaf, x, y, z):
     return norm_at(blob, ints, leaf, x, y, z) + min(s, MAX_SCALE) - 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def inverse_radius(blob, ints, leaf, face, a, b):
     """Return W(a, b) by the exact formula."""
     x, y, z = direction_of(face, a, b)
@@ -120,7 +119,7 @@ def inverse_radius(blob, ints, leaf, face, a, b):
     return norm_at(blob, ints, leaf, x, y, z) / (1.0 - min(s, MAX_SCALE))
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def scale_range(blob, ints, leaf, block, face, a, b, half_a, half_b):
     """Return (s, s_a, s_b, wide_a, wide_b, s_aa, s_ab, s_bb, rest2, rest3) of the scale field over a rectangle.
 
@@ -216,14 +215,14 @@ def scale_range(blob, ints, leaf, block, face, a, b, half_a, half_b):
     return value, ga, gb, wide_a, wide_b, haa, hab, hbb, rest2, rest3
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def axis_scale(blob, half_axes, axis, sign):
     """Return 1/A² of the half axis on one side."""
     size = blob[half_axes + axis] if sign > 0.0 else blob[half_axes + axis + 1]
     return 1.0 / (size * size)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _third(n_lo, n_hi, n1, n2, d, s1, s2, s3):
     """Return a bound of the third derivative of W = N·D, D = 1/(1 − s), along any line of the chart.
 
@@ -235,7 +234,7 @@ def _third(n_lo, n_hi, n1, n2, d, s1, s2, s3):
     return 3.0 * n1 * n2 / n_lo * d + 3.0 * n2 * d1 + 3.0 * n1 * d2 + n_hi * d3
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
     """Return (value, slope_a, slope_b, error, spread_a, spread_b, lo, hi, bend_lo, bend_hi, kink, third) of W.
 

@@ -1,12 +1,13 @@
-"""Inside or outside, for LPS points: a voxel's byte, else the owner's map, else the exact formula."""
+"""Inside or outside, for LPS points: a voxel's byte or plane, else the owner's map, else the exact formula."""
 
 import math
 
+import numpy as np
 from numba import njit
 
-from hhsr.kernels.layout import integers, tables
-from hhsr.kernels.tree import into_tree
-from hhsr.kernels.voxels import solid_contains
+from hhsr.kernels.layout import VOXELS, integers, tables
+from hhsr.kernels.tree import contains_point, into_tree
+from hhsr.kernels.voxels import voxel_state
 
 INSIDE, OUTSIDE, INVALID = 1, 0, -1
 
@@ -18,13 +19,18 @@ def contains_one(blob, x, y, z):
     if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
         return INVALID
     x, y, z = into_tree(blob, ints, x, y, z)
-    return INSIDE if solid_contains(blob, ints, tab, 0, x, y, z) else OUTSIDE
+    state = voxel_state(blob, ints, tab, blob.view(np.uint8), blob.view(np.int32), x, y, z) if ints[VOXELS] != 0 else 0
+    if state == 0:
+        return INSIDE if contains_point(blob, ints, tab, 0, x, y, z) else OUTSIDE
+    return INSIDE if state > 0 else OUTSIDE
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def contains_many(blob, points, out):
     """Fill (n,) int8 with 1 inside, 0 outside, −1 not finite; return how many are not finite."""
     ints, tab = integers(blob), tables(blob)
+    octets, words = blob.view(np.uint8), blob.view(np.int32)
+    grid = ints[VOXELS] != 0
     bad = 0
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -34,5 +40,9 @@ def contains_many(blob, points, out):
                 bad += 1
                 continue
         x, y, z = into_tree(blob, ints, x, y, z)
-        out[i] = INSIDE if solid_contains(blob, ints, tab, 0, x, y, z) else OUTSIDE
+        state = voxel_state(blob, ints, tab, octets, words, x, y, z) if grid else 0
+        if state == 0:
+            out[i] = INSIDE if contains_point(blob, ints, tab, 0, x, y, z) else OUTSIDE
+        else:
+            out[i] = INSIDE if state > 0 else OUTSIDE
     return bad

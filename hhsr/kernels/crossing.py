@@ -1,7 +1,6 @@
-"""All crossings of a segment with the solid: clip down the tree, follow each owner's own surface (DESIGN §2, §4).
+"""All crossings of a segment with the solid, and the first (DESIGN §2, §4): the walk of the voxels, else the tree.
 
-The state at each instant is the owner's; where it changes, inside an owner or across a clip, there is a crossing. So
-entering and leaving alternate by construction, and between two outside points their number is even.
+Entering and leaving alternate by construction, and between two outside points their number is even.
 """
 
 import math
@@ -9,146 +8,26 @@ import math
 import numpy as np
 from numba import njit
 
-from hhsr.kernels.layout import (
-    CUT,
-    FRAME,
-    MODEL,
-    NODE_FLOAT_SIZE,
-    NODE_FLOATS,
-    NODE_INT_SIZE,
-    NODE_INTS,
-    OWNER_INT_SIZE,
-    OWNER_INTS,
-    OWNER_KIND,
-    OWNER_RECORD,
-    RETAINED,
-    ROTATED,
-    VOXELS,
-    integers,
-    tables,
-)
-from hhsr.kernels.part import TRIANGLES, part_arrays, part_contains
-from hhsr.kernels.segment import PIECES, emit, leaf_crossings
-from hhsr.kernels.slab_segment import slab_crossings
-from hhsr.kernels.tree import into_leaf, into_tree, turn_into_leaf
-from hhsr.kernels.triangle_build import STACK
-from hhsr.kernels.triangles import segment_crossings, sort_crossings
-from hhsr.kernels.voxels import leap, solid_contains
+from hhsr.kernels.clipped import follow_tree, merge_touches
+from hhsr.kernels.layout import VOXELS, integers, tables
+from hhsr.kernels.segment import emit
+from hhsr.kernels.stretch import PIECES
+from hhsr.kernels.tree import into_tree
+from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.voxels import solid_contains
+from hhsr.kernels.walk import follow_voxels
 
 SLOTS = 64  # pending tree nodes of one segment: three a level
-NUDGE = 1e-7  # mm past a voxel's border: less than voxels are proven beyond theirs
 MERGE = 1e-9  # mm: a leaving and an entering closer than this are one touch
 
 
 @njit(cache=True, error_model="numpy")
 def scratch():
     """Return (work, slots, pending): what one thread needs to follow segments."""
-    return np.empty((PIECES, 8)), np.empty((SLOTS, 2)), np.empty(SLOTS, dtype=np.int64)
+    return np.empty((PIECES + 1, 8)), np.empty((SLOTS, 2)), np.empty(SLOTS, dtype=np.int64)
 
 
-@njit(cache=True, error_model="numpy")
-def part_crossings(blob, ints, part, px, py, pz, dx, dy, dz, t0, t1, state, out, count):
-    """Follow a retained part: the exact crossings of the whole segment, and of them those in [t0, t1]."""
-    if ints[part + TRIANGLES] == 0:
-        return emit(state, False, t0, out, count)
-    boxes, links, corners = part_arrays(blob, ints, part)
-    start, end, inverse = np.empty(3), np.empty(3), np.empty(3)
-    start[0], start[1], start[2] = px, py, pz
-    end[0], end[1], end[2] = px + dx, py + dy, pz + dz
-    stack = np.empty(STACK, dtype=np.int64)
-    t, index, way = np.empty(32), np.empty(32, dtype=np.int64), np.empty(32, dtype=np.int8)
-    found = segment_crossings(boxes, links, corners, start, end, t, index, way, inverse, stack)
-    if found > t.shape[0]:
-        t, index, way = np.empty(found), np.empty(found, dtype=np.int64), np.empty(found, dtype=np.int8)
-        found = segment_crossings(boxes, links, corners, start, end, t, index, way, inverse, stack)
-    sort_crossings(t, index, way, found)
-    inside = part_contains(blob, ints, part, px, py, pz)
-    k = 0
-    while k < found and t[k] <= t0:
-        inside = not inside
-        k += 1
-    state, count = emit(state, inside, t0, out, count)
-    while k < found and t[k] < t1:
-        inside = not inside
-        state, count = emit(state, inside, t[k], out, count)
-        k += 1
-    return state, count
-
-
-@njit(cache=True, error_model="numpy")
-def owner_crossings(
-    blob, ints, tab, owner, px, py, pz, dx, dy, dz, t0, t1, resolution, tolerance, state, out, count, work
-):
-    """Follow p + t·d (tree's frame) through the region of one owner; return (state, count)."""
-    o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
-    kind, record = ints[o + OWNER_KIND], ints[o + OWNER_RECORD]
-    if kind == MODEL:
-        qx, qy, qz = into_leaf(blob, ints, record, px, py, pz)
-        if ints[record + ROTATED] != 0:
-            dx, dy, dz = turn_into_leaf(blob, ints[record + FRAME], dx, dy, dz)
-        return leaf_crossings(
-            blob, ints, tab, record, qx, qy, qz, dx, dy, dz, t0, t1, resolution, tolerance, state, out, count, work
-        )
-    if kind == RETAINED:
-        return part_crossings(blob, ints, record, px, py, pz, dx, dy, dz, t0, t1, state, out, count)
-    return slab_crossings(
-        blob, ints, record, px, py, pz, dx, dy, dz, t0, t1, resolution, tolerance, state, out, count, work
-    )
-
-
-@njit(cache=True, error_model="numpy")
-def _follow_tree(
-    blob, ints, tab, root, px, py, pz, dx, dy, dz, begin, end, gap, resolution, tolerance, first, state, out, count,
-    work, slots, pending,
-):  # fmt: skip
-    """Follow p + t·d for t in [begin, end] by clipping down the tree; return (state, count, done)."""
-    pending[0], slots[0, 0], slots[0, 1] = root, begin, end
-    depth = 1
-    while depth > 0:
-        depth -= 1
-        node, t0, t1 = pending[depth], slots[depth, 0], slots[depth, 1]
-        i = ints[NODE_INTS] + NODE_INT_SIZE * node
-        if node < 0 or ints[i] != CUT:
-            owner = ints[i + 3] if node >= 0 else -1 - node
-            state, count = owner_crossings(
-                blob, ints, tab, owner, px, py, pz, dx, dy, dz, t0, t1, resolution, tolerance, state, out, count, work
-            )
-            count = _merge_touches(out, count, gap)
-            if first and count > 0 and out[0] < t1 - gap:
-                return state, count, True
-            continue
-        f = ints[NODE_FLOATS] + NODE_FLOAT_SIZE * node
-        h = blob[f] * px + blob[f + 1] * py + blob[f + 2] * pz - blob[f + 3]
-        g = blob[f] * dx + blob[f + 1] * dy + blob[f + 2] * dz
-        d = blob[f + 4]
-        # Intervals left of the slab, in it, right of it; the last along the segment is pushed first.
-        if g == 0.0:
-            if abs(h) < d:
-                pending[depth] = -1 - ints[i + 3]
-            else:
-                pending[depth] = ints[i + 2] if h >= 0.0 else ints[i + 1]
-            slots[depth, 0], slots[depth, 1] = t0, t1
-            depth += 1
-            continue
-        near, far = (-d - h) / g, (d - h) / g
-        one, other = ints[i + 1], ints[i + 2]
-        if g < 0.0:
-            near, far, one, other = far, near, other, one
-        if far < t1:
-            pending[depth], slots[depth, 0], slots[depth, 1] = other, max(far, t0), t1
-            depth += 1
-        if d > 0.0:
-            a, b = max(near, t0), min(far, t1)
-            if a < b:
-                pending[depth], slots[depth, 0], slots[depth, 1] = -1 - ints[i + 3], a, b
-                depth += 1
-        if near > t0:
-            pending[depth], slots[depth, 0], slots[depth, 1] = one, t0, min(near, t1)
-            depth += 1
-    return state, count, False
-
-
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def follow_segment(
     blob, ints, tab, root, px, py, pz, ex, ey, ez, resolution, tolerance, first, out, work, slots, pending
 ):
@@ -160,61 +39,39 @@ def follow_segment(
     """
     dx, dy, dz = ex - px, ey - py, ez - pz
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    begin = solid_contains(blob, ints, tab, root, px, py, pz)
     if length == 0.0:
-        return begin, 0
-    state, count = begin, 0
+        return solid_contains(blob, ints, tab, root, px, py, pz), 0
     gap = MERGE / length
-    done = False
-    if root != 0 or ints[VOXELS] == 0:
-        state, count, done = _follow_tree(
-            blob, ints, tab, root, px, py, pz, dx, dy, dz, 0.0, 1.0, gap, resolution, tolerance, first, state, out,
-            count, work, slots, pending,
-        )  # fmt: skip
-    else:
-        nudge = max(NUDGE / length, 1e-15)
-        t, since = 0.0, -1.0
-        while t < 1.0 and not done:
-            proven, end = leap(blob, ints, px, py, pz, dx, dy, dz, t)
-            if proven == 0:
-                since = t if since < 0.0 else since
-            elif since >= 0.0:
-                state, count, done = _follow_tree(
-                    blob, ints, tab, root, px, py, pz, dx, dy, dz, since, t, gap, resolution, tolerance, first, state,
-                    out, count, work, slots, pending,
-                )  # fmt: skip
-                since = -1.0
-            if proven != 0 and not done:
-                state, count = emit(state, proven > 0, t, out, count)
-                count = _merge_touches(out, count, gap)
-                done = first and count > 0
-            t = max(end, t) + nudge
-        if since >= 0.0 and not done:
-            state, count, done = _follow_tree(
-                blob, ints, tab, root, px, py, pz, dx, dy, dz, since, 1.0, gap, resolution, tolerance, first, state,
-                out, count, work, slots, pending,
-            )  # fmt: skip
-    if done:
-        return begin, count
-    if count <= out.shape[0]:
+    if root == 0 and ints[VOXELS] != 0:
+        return follow_voxels(
+            blob,
+            ints,
+            tab,
+            px,
+            py,
+            pz,
+            ex,
+            ey,
+            ez,
+            length,
+            gap,
+            resolution,
+            tolerance,
+            first,
+            out,
+            work,
+            slots,
+            pending,
+        )
+    begin = solid_contains(blob, ints, tab, root, px, py, pz)
+    state, count, done = follow_tree(
+        blob, ints, tab, root, px, py, pz, dx, dy, dz, 0.0, 1.0, gap, resolution, tolerance, first, begin, out, 0,
+        work, slots, pending,
+    )  # fmt: skip
+    if not done and count <= out.shape[0]:
         _, count = emit(state, solid_contains(blob, ints, tab, root, ex, ey, ez), 1.0, out, count)
-        count = _merge_touches(out, count, gap)
+        count = merge_touches(out, count, gap)
     return begin, count
-
-
-@njit(cache=True, error_model="numpy")
-def _merge_touches(out, count, gap):
-    """Drop pairs of crossings closer than `gap`: rounding at the meeting of two proofs. Keeps the parity."""
-    if count < 2 or count > out.shape[0]:
-        return count
-    kept = 0
-    for i in range(count):
-        if kept > 0 and out[i] - out[kept - 1] <= gap:
-            kept -= 1
-        else:
-            out[kept] = out[i]
-            kept += 1
-    return kept
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -240,6 +97,61 @@ def cross_many(blob, starts, ends, resolution, tolerance, counts, begins, ts):
         counts[i] = count
         used += count
     return starts.shape[0], used
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def place_many(starts, ends, offsets, begins, t, points, entering):
+    """Fill points (m, 3) and entering (m,) of crossings t (m,) of (n, 3) → (n, 3), offsets (n + 1,), begins (n,)."""
+    for i in range(starts.shape[0]):
+        inside = begins[i]
+        for k in range(offsets[i], offsets[i + 1]):
+            inside = not inside
+            entering[k] = inside
+            for c in range(3):
+                points[k, c] = starts[i, c] + t[k] * (ends[i, c] - starts[i, c])
+
+
+@njit(cache=True, error_model="numpy")
+def cross_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance, offsets, t, points, entering):
+    """Follow one LPS segment; return how many crossings it has, −1 where not finite or more than t (k,) holds.
+
+    Fills offsets (2,), t, points (k, 3), entering (k + 1,), the last of it true: all that `Crossings` holds.
+    """
+    ints, tab = integers(blob), tables(blob)
+    if not math.isfinite(ax + ay + az + bx + by + bz):
+        return -1
+    work, slots, pending = scratch()
+    px, py, pz = into_tree(blob, ints, ax, ay, az)
+    ex, ey, ez = into_tree(blob, ints, bx, by, bz)
+    inside, count = follow_segment(
+        blob, ints, tab, 0, px, py, pz, ex, ey, ez, resolution, tolerance, False, t, work, slots, pending
+    )
+    if count > t.shape[0]:
+        return -1
+    offsets[0], offsets[1] = 0, count
+    entering[t.shape[0]] = True
+    for k in range(count):
+        inside = not inside
+        entering[k] = inside
+        points[k, 0], points[k, 1] = ax + t[k] * (bx - ax), ay + t[k] * (by - ay)
+        points[k, 2] = az + t[k] * (bz - az)
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def first_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance):
+    """Return t of the first crossing of one LPS segment: NaN none, −1 not finite."""
+    ints, tab = integers(blob), tables(blob)
+    if not math.isfinite(ax + ay + az + bx + by + bz):
+        return -1.0
+    work, slots, pending = scratch()
+    t = np.empty(64)
+    px, py, pz = into_tree(blob, ints, ax, ay, az)
+    ex, ey, ez = into_tree(blob, ints, bx, by, bz)
+    _, count = follow_segment(
+        blob, ints, tab, 0, px, py, pz, ex, ey, ez, resolution, tolerance, True, t, work, slots, pending
+    )
+    return t[0] if count > 0 else np.nan
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -281,7 +193,7 @@ def first_many(blob, starts, ends, resolution, tolerance, out):
     return bad
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _finite(starts, ends, i):
     for k in range(3):
         if not (math.isfinite(starts[i, k]) and math.isfinite(ends[i, k])):

@@ -6,7 +6,6 @@ Nothing is proven by it: where it ends the surface point is an upper bound.
 import math
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.cell import direction_of, face_of
 from hhsr.kernels.jet import has_jets, inverse_radius_bend
@@ -23,11 +22,12 @@ from hhsr.kernels.layout import (
 from hhsr.kernels.maps import outside_region, plane_of
 from hhsr.kernels.patch import BEST, START, TOLERANCE, offer
 from hhsr.kernels.tree import into_leaf, owner_of, turn_out_of_leaf
+from hhsr.kernels.unmanaged import unmanaged
 
 STEPS = 10
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def descend(blob, ints, owner, face, a, b, search):
     """Offer the surface points on a way of steepest nearing from (a, b) of an owner; return whether it came to a foot.
 
@@ -105,7 +105,7 @@ def descend(blob, ints, owner, face, a, b, search):
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def descend_from(blob, ints, x, y, z, search):
     """Descend from a surface point of the tree's frame; return whether it came to a foot."""
     owner = owner_of(blob, ints, 0, x, y, z)

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from hhsr.kernels.facets import RADIUS, THICK
+from hhsr.kernels.unmanaged import unmanaged
 
 DISC_SIZE = 8
 WIDE = 16
@@ -70,7 +71,7 @@ LOOSE = 2e-6
 _SHORT, _LONG, _NONE, _ALL = np.float32(1.0 - 1e-6), np.float32(1.0 + 1e-6), np.float32(0.0), np.float32(1.0)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def bound_to_point(blocks, i, x, y, z, loose, most, bounds):
     """Fill bounds (16,) float32 with lower bounds of the squared distances of a point to the discs of a block.
 
@@ -90,7 +91,7 @@ def bound_to_point(blocks, i, x, y, z, loose, most, bounds):
     return mask
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def bound_to_segment(blocks, i, x, y, z, dx, dy, dz, loose, most, bounds):
     """Do as `bound_to_point` for p + t·d: by the slab about a disc's plane, and by the ball about the disc."""
     k, mask, limit = np.uint64(i), np.uint32(0), np.float32(most) * _LONG
@@ -121,7 +122,7 @@ for _k in range(32):
     _PLACES[((0x077CB531 << _k) & 0xFFFFFFFF) >> 27] = _k
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def lowest_bit(mask):
     """Return (c, rest): the place of the lowest bit of a mask that is not 0, and the mask without it."""
     bit = mask & (~mask + np.uint32(1))

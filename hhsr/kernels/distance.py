@@ -12,6 +12,7 @@ from numba import njit
 
 from hhsr.kernels.crossing import follow_segment, scratch
 from hhsr.kernels.descent import descend_from
+from hhsr.kernels.discs import WIDE
 from hhsr.kernels.foot import foot_in_chart
 from hhsr.kernels.layout import (
     EDGE_COUNT,
@@ -55,28 +56,28 @@ from hhsr.kernels.tree import (
     owner_of,
     turn_out_of_leaf,
 )
-from hhsr.kernels.voxels import solid_contains, voxel_at
+from hhsr.kernels.unmanaged import managed, unmanaged
+from hhsr.kernels.voxels import solid_contains
 
-FAR_VOXELS = 3  # away from the surface, a point's own chart proves nothing
 SPANS = 256  # parts of one segment's stretch inside
 SIDE = 1e-6  # mm: how far off a plane its two sides are asked
 
 
-@njit(cache=True, error_model="numpy")
+@managed
 def near_scratch():
     """Return (search, local, nodes, keys, corners, spare, rects): what one thread needs for a search."""
     return (
         np.zeros(SEARCH_SIZE),
         np.zeros(SEARCH_SIZE),
         np.empty(LATE + NODE_ROOM, dtype=np.int64),
-        np.empty(LATE + NODE_ROOM),
+        np.empty(LATE + NODE_ROOM + WIDE // 2),
         np.empty((ROOM, 3)),
         np.empty((ROOM, 3)),
         np.empty((NODE_ROOM, 6)),
     )
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def set_search(search, px, py, pz, dx, dy, dz, tolerance):
     """Begin a search about p + t·d."""
     search[START], search[START + 1], search[START + 2] = px, py, pz
@@ -87,7 +88,7 @@ def set_search(search, px, py, pz, dx, dy, dz, tolerance):
     search[TOLERANCE] = tolerance
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _nearest_on_owner(blob, ints, owner, search, nodes, keys, corners, spare, rects):
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
     kind, record = ints[o + OWNER_KIND], ints[o + OWNER_RECORD]
@@ -98,7 +99,7 @@ def _nearest_on_owner(blob, ints, owner, search, nodes, keys, corners, spare, re
         nearest_on_slab(blob, ints, record, planes, count, search, corners, spare, rects)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _nearest_step(blob, ints, tab, search):
     """Offer the feet of the segment's ends on the cutting planes where the sides disagree, and the straight edges."""
     for end in range(2 if search[LENGTH2] > 0.0 else 1):
@@ -136,12 +137,10 @@ def _nearest_step(blob, ints, tab, search):
             offer(search, math.sqrt(d2), t, blob[o] + s * ux, blob[o + 1] + s * uy, blob[o + 2] + s * uz)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _by_chart(blob, ints, tab, search, local):
     """Offer the foot of a point in the chart of its own leaf; return whether that is proven to be the nearest."""
     px, py, pz = search[START], search[START + 1], search[START + 2]
-    if abs(voxel_at(blob, ints, px, py, pz)) > FAR_VOXELS:
-        return False
     owner = owner_of(blob, ints, 0, px, py, pz)
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
     if ints[o + OWNER_KIND] != MODEL:
@@ -157,7 +156,7 @@ def _by_chart(blob, ints, tab, search, local):
     return proven
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects):
     """Find the surface point nearest to the search's segment, to its tolerance: truth ∈ [best − tolerance, best]."""
     if search[LENGTH2] == 0.0 and _by_chart(blob, ints, tab, search, local):
@@ -198,7 +197,7 @@ def nearest_many(blob, points, tolerance, distance, foot):
     return bad
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _highest(px, py, pz, dx, dy, dz, t0, t1, ax, ay, az, bx, by, bz):
     """Return the greatest min(|p(t) − a|, |p(t) − b|)² on [t0, t1], and its t: an upper bound of the distance²."""
     dd = dx * dx + dy * dy + dz * dz
@@ -224,7 +223,7 @@ def _highest(px, py, pz, dx, dy, dz, t0, t1, ax, ay, az, bx, by, bz):
     return best, where
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, b, bx, by, bz):
     """Write a span: its ends' t and surface points, the highest bound between them, and its t."""
     spans[s, 0], spans[s, 1], spans[s, 2], spans[s, 3] = a, ax, ay, az
@@ -233,7 +232,7 @@ def _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, b, bx, by, bz):
     spans[s, 8] = math.sqrt(value2)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def deepest(
     blob, ints, tab, px, py, pz, dx, dy, dz, t0, t1, on0, on1, tolerance, floor, out,
     search, local, nodes, keys, corners, spare, rects, spans,

@@ -38,11 +38,12 @@ from hhsr.kernels.maps import (
     ray_thickness,
 )
 from hhsr.kernels.polygon import ROOM, clip_polygon
+from hhsr.kernels.unmanaged import unmanaged
 
 THICK, RADIUS = 6, 7  # of a facet's disc (`hhsr.kernels.discs`)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def facet_cell(ints, leaf, code):
     """Return (slot, face, a, b, half) of the cell of a facet's code: its float32 slot, centre and half side."""
     bits = ints[leaf + CELL_BITS]
@@ -58,7 +59,7 @@ def facet_cell(ints, leaf, code):
     return slot, base >> 2 * bits, (2 * i + 1) * half - 1.0, (2 * j + 1) * half - 1.0, half
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _put_disc(disc, frame, cx, cy, cz, nx, ny, nz, thick, radius):
     """Write a disc given in the leaf's frame, in the tree's."""
     for k in range(3):
@@ -123,7 +124,7 @@ def list_facets(blob, owner, leaf, planes, count, codes, discs):
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _along_curve(i, j, side):
     """Return the place of (i, j) along Hilbert's curve over a square of `side`, a power of 2: unbroken."""
     place = 0

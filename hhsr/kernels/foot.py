@@ -9,7 +9,6 @@ free of surface, and with it every smaller ball inside it.
 import math
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.cell import chart_of, direction_of, face_of
 from hhsr.kernels.jet import has_jets, inverse_radius_jet
@@ -24,12 +23,13 @@ from hhsr.kernels.layout import (
     OWNER_RECORD,
 )
 from hhsr.kernels.maps import bend_over, plane_of
+from hhsr.kernels.unmanaged import unmanaged
 
 STEPS = 5
 WIDEST = 3  # base cells a side that a ball may cover
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def ball_is_free(px, py, pz, radius, face, a, b, way, w, ga, gb, bend_lo, bend_hi):
     """Return whether no surface over a piece of a face lies nearer to a point than `radius`; all in the leaf's frame.
 
@@ -55,7 +55,7 @@ def ball_is_free(px, py, pz, radius, face, a, b, way, w, ga, gb, bend_lo, bend_h
     return kappa * radius < 1.0 and kappa * (away2 - radius * radius) <= 2.0 * (height - radius)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def step_to_foot(px, py, pz, face, a, b, w, ga, gb):
     """Return (a, b, m) of the foot of a point on a jet's plane, the next contact; m ≤ 0 where there is none."""
     gx, gy, gz = plane_of(face, a, b, w, ga, gb)
@@ -63,7 +63,7 @@ def step_to_foot(px, py, pz, face, a, b, w, ga, gb):
     return chart_of(face, px - h * gx, py - h * gy, pz - h * gz)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, foot):
     """Return (distance, proven) of a point of the owner's region (leaf's frame) to its own leaf along the point's
     chart.

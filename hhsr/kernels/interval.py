@@ -4,12 +4,12 @@ Rounding: every bound that leaves this floor is widened by `SLACK` relative to i
 thousand times what the handful of float64 operations before it can lose.
 """
 
-from numba import njit
+from hhsr.kernels.unmanaged import unmanaged
 
 SLACK = 1e-11
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def product(lo, hi, other_lo, other_hi):
     """Return the interval of x·y."""
     a = lo * other_lo
@@ -19,7 +19,7 @@ def product(lo, hi, other_lo, other_hi):
     return min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def signed(lo, hi, sign):
     """Return the interval of sign·x, sign ±1."""
     if sign >= 0.0:
@@ -27,7 +27,7 @@ def signed(lo, hi, sign):
     return -hi, -lo
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def widened(lo, hi):
     """Return the interval rounded outward."""
     slack = SLACK * max(abs(lo), abs(hi))

@@ -2,21 +2,20 @@
 
 import math
 
-from numba import njit
-
 from hhsr.kernels.cell import axis_scale, block_of, direction_of
 from hhsr.kernels.layout import AZIMUTH_COUNT, BLOCK_DATA, BLOCK_ROWS, BLOCKS, ELEVATION_COUNT, HALF_AXES
 from hhsr.kernels.leaf import MAX_SCALE
 from hhsr.kernels.sphere_rbf import gaussian_bend, gaussian_jet
+from hhsr.kernels.unmanaged import unmanaged
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def has_jets(ints, leaf):
     """Return whether a leaf's base is an ellipsoid, whose derivatives are closed forms."""
     return ints[leaf + AZIMUTH_COUNT] == 0 and ints[leaf + ELEVATION_COUNT] == 0
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def inverse_radius_jet(blob, ints, leaf, face, a, b):
     """Return (W, ∂W/∂a, ∂W/∂b) at (a, b) by the exact formulas; W is 0 where the scale field is capped: no gradient."""
     x, y, z = direction_of(face, a, b)
@@ -47,7 +46,7 @@ def inverse_radius_jet(blob, ints, leaf, face, a, b):
     return w, d * (na / norm + w * sa), d * (nb / norm + w * sb)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def inverse_radius_bend(blob, ints, leaf, face, a, b):
     """Return (W, W_a, W_b, W_aa, W_ab, W_bb) at (a, b) by the exact formulas; W is 0 where the field is capped."""
     length = math.sqrt(1.0 + a * a + b * b)

@@ -18,13 +18,13 @@ LOWEST, HIGHEST = 11, 12  # float slots of the box of the solid, tree frame
 # Facets (hhsr.kernels.facets): how many, integer slot of their codes, integer slot of (levels; of each the
 # number of its first block and of its discs; float32 slot and number of all blocks).
 FACET_COUNT, FACET_CODES, FACET_LEVELS = 13, 14, 15
-# Voxels (hhsr.kernels.voxels): integer slot of (nx, ny, nz), float slot of (lowest corner 3, side, 1/side), slot of the
-# bytes; 0 where there are none.
-VOXELS, VOXEL_FRAME, VOXEL_BYTES = 16, 17, 18
+# Voxels (hhsr.kernels.voxels): integer slot of the grid's record, float slot of (lowest corner 3, side, 1/side); 0
+# where there are none.
+VOXELS, VOXEL_FRAME = 16, 17
 # Seeds (hhsr.kernels.seeds): integer slot of (nx, ny, nz), float slot of (lowest corner 3, 1/side, widest coordinate),
 # slot of the int32 numbers of facets.
-SEED_CELLS, SEED_FRAME, SEEDS = 19, 20, 21
-HEADER_SIZE = 22
+SEED_CELLS, SEED_FRAME, SEEDS = 18, 19, 20
+HEADER_SIZE = 21
 
 # Nodes: 4 integers (kind, left, right, owner), 8 floats (normal 3, offset, half width).
 CUT, MODEL, RETAINED, SLAB = 0, 1, 2, 3

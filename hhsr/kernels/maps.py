@@ -30,12 +30,13 @@ from hhsr.kernels.layout import (
     VALUE,
     integers,
 )
+from hhsr.kernels.unmanaged import unmanaged
 
 UP = 1.0 + 3e-7  # more than one float32 rounding
 STEEP = 1e3  # mm: thickness given to a cell that faces its centre too obliquely to have a tangent plane
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def level_start(cells, side):
     """Return the index of the first pyramid node of the level with `side` base cells a face side."""
     start = 0
@@ -46,13 +47,13 @@ def level_start(cells, side):
     return start
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def pyramid_size(cells):
     """Return how many nodes the pyramid over `cells`² base cells a face has."""
     return level_start(cells, 1) + 6
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def cell_at(ints, leaf, face, a, b):
     """Return (slot, a, b, half) of the cell that holds (a, b): its float32 slot, its centre and half its side."""
     n = ints[leaf + CELLS]
@@ -66,7 +67,7 @@ def cell_at(ints, leaf, face, a, b):
     return slot, (2 * (i * s + p) + 1) * half - 1.0, (2 * (j * s + q) + 1) * half - 1.0, half
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def bend_over(tab, ints, leaf, face, i0, i1, j0, j1):
     """Return the range of the eigenvalues of ∂²W over base cells i0 … i1, j0 … j1 of a face."""
     n = ints[leaf + CELLS]
@@ -78,13 +79,13 @@ def bend_over(tab, ints, leaf, face, i0, i1, j0, j1):
     return bend_lo, bend_hi
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def quad_radius_ok(value, slope_a, slope_b, error, half_a, half_b):
     """Return whether the tangent plane of a cell faces the centre safely, so that its corners are points in space."""
     return value - abs(slope_a) * half_a - abs(slope_b) * half_b - error > 0.25 * value
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def plane_of(face, a, b, value, slope_a, slope_b):
     """Return g of the plane g·p = 1 that is a cell's linear model of W in space, leaf frame."""
     c = value - slope_a * a - slope_b * b
@@ -97,7 +98,7 @@ def plane_of(face, a, b, value, slope_a, slope_b):
     return slope_a, slope_b, c
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def cell_corners(face, a, b, half, value, slope_a, slope_b, corners):
     """Fill corners (ROOM, 3)[:4] of a cell's flat quad, leaf frame."""
     for corner in range(4):
@@ -108,7 +109,7 @@ def cell_corners(face, a, b, half, value, slope_a, slope_b, corners):
         corners[corner, 0], corners[corner, 1], corners[corner, 2] = x * m, y * m, z * m
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def quad_radius(face, a, b, half, value, slope_a, slope_b):
     """Return a bound of how far (mm) any point of a cell's flat quad lies from dir(a, b)/value.
 
@@ -119,7 +120,7 @@ def quad_radius(face, a, b, half, value, slope_a, slope_b):
     return half * (1.4142136 * value + length * turn) / (value * (value - turn * half)) * (1.0 + 1e-9)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def model_thickness(face, a, b, half_a, half_b, value, slope_a, slope_b, error):
     """Return how far (mm) a cell's surface can lie from its plane: m·|W − model|/|g|, m = 1/W ≤ 1/(lowest − error)."""
     gx, gy, gz = plane_of(face, a, b, value, slope_a, slope_b)
@@ -127,7 +128,7 @@ def model_thickness(face, a, b, half_a, half_b, value, slope_a, slope_b, error):
     return error / ((low - error) * math.sqrt(gx * gx + gy * gy + gz * gz)) * (1.0 + 1e-9)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def ray_thickness(face, a, b, half_a, half_b, value, slope_a, slope_b, error):
     """Return how far (mm) surface and plane of a cell can lie apart along a ray: |dir|·e / (T·(T − e))."""
     reach_a, reach_b = abs(a) + half_a, abs(b) + half_b
@@ -135,7 +136,7 @@ def ray_thickness(face, a, b, half_a, half_b, value, slope_a, slope_b, error):
     return math.sqrt(1.0 + reach_a * reach_a + reach_b * reach_b) * error / (low * (low - error)) * (1.0 + 1e-9)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def cell_sphere(face, a, b, half_a, half_b, value, slope_a, slope_b, error, lo, hi):
     """Return (x, y, z, radius) of a sphere about dir(a, b)/value, leaf frame, that encloses the surface of a cell."""
     flat = quad_radius_ok(value, slope_a, slope_b, error, half_a, half_b)
@@ -154,7 +155,7 @@ def cell_sphere(face, a, b, half_a, half_b, value, slope_a, slope_b, error, lo, 
     return cx, cy, cz, (radius + grow) * (1.0 + 1e-9)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def outside_region(blob, planes, count, x, y, z, radius):
     """Return whether a ball lies wholly outside the region of `count` planes n·p ≤ c from float slot `planes` on."""
     for k in range(count):
@@ -164,7 +165,7 @@ def outside_region(blob, planes, count, x, y, z, radius):
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _write(out, value, ga, gb, error, half, da, db, kink, third):
     out[VALUE], out[SLOPE_A], out[SLOPE_B] = value, ga, gb
     out[SPREAD_A], out[SPREAD_B] = (da + 1e-7 * abs(ga)) * UP, (db + 1e-7 * abs(gb)) * UP

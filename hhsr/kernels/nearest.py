@@ -5,7 +5,6 @@ its flat quad, widened by its proven thickness, does; what is left is settled at
 """
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.descent import descend
 from hhsr.kernels.discs import BLOCK, DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment, lowest_bit
@@ -34,6 +33,7 @@ from hhsr.kernels.patch import (
     FOOT,
     LATE,
     LENGTH2,
+    NODE_ROOM,
     START,
     TOLERANCE,
     VECTOR,
@@ -45,12 +45,13 @@ from hhsr.kernels.patch import (
 from hhsr.kernels.quadratic import settle_square
 from hhsr.kernels.seeds import seed_at
 from hhsr.kernels.tree import into_leaf, turn_into_leaf, turn_out_of_leaf
+from hhsr.kernels.unmanaged import unmanaged
 
 PATIENCE = 16  # facets that may wait
 SAMPLES = 4  # points of a segment that ask for a seed
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _settle(blob, ints, tab, code, search, local, corners, spare, rects):
     """Offer the nearest point of a facet, or prove that it holds none: by quadratics where no cut touches it."""
     owner = ints[OWNER_INTS] + OWNER_INT_SIZE * (code >> 24)
@@ -82,7 +83,7 @@ def _settle(blob, ints, tab, code, search, local, corners, spare, rects):
         offer(search, local[BEST], local[BEST_T], x + blob[frame], y + blob[frame + 1], z + blob[frame + 2])
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def seed_point(blob, ints, search):
     """Offer surface points on the way down from the facet that is named near the search's point; nothing is proven."""
     if ints[FACET_COUNT] == 0:
@@ -93,7 +94,7 @@ def seed_point(blob, ints, search):
     descend(blob, ints, code >> 24, face, a, b, search)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _seed_segment(blob, ints, search, local):
     """Offer a surface point near the search's segment: the nearest of a few points', then to and fro between both."""
     local[LENGTH2], local[TOLERANCE] = 0.0, search[TOLERANCE]
@@ -114,12 +115,12 @@ def _seed_segment(blob, ints, search, local):
             offer(search, distance, t, local[FOOT], local[FOOT + 1], local[FOOT + 2])
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spare, rects):
     """Improve the search (tree's frame) by the surface of all model leaves, each within its region.
 
-    nodes, keys: (LATE + NODE_ROOM,) scratch: pending blocks and their bounds, and from LATE on the facets yet to be
-    settled.
+    nodes, keys: (LATE + NODE_ROOM + 8,) scratch: pending blocks and their bounds, from LATE on the facets
+    yet to be settled; last the bounds of a block.
     """
     if ints[FACET_COUNT] == 0:
         return
@@ -135,7 +136,7 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
     dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
     first = ints[levels + 1 + 2 * ints[levels]]
     blocks = tab[first : first + BLOCK * ints[levels + 2 + 2 * ints[levels]]].reshape(-1, DISC_SIZE, WIDE)
-    bounds = np.empty(WIDE, dtype=np.float32)
+    bounds = keys[LATE + NODE_ROOM :].view(np.float32)
     reach = max(abs(x), abs(y), abs(z)) + max(abs(x + dx), abs(y + dy), abs(z + dz))
     loose = LOOSE * (reach + blob[ints[SEED_FRAME] + 4])
     limit = search[BEST] - search[TOLERANCE]
@@ -184,7 +185,7 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
             _settle(blob, ints, tab, nodes[LATE + waiting], search, local, corners, spare, rects)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def owner_planes(ints, owner):
     """Return (float slot, number) of the planes of an owner's region, in the owner's frame."""
     return ints[owner + OWNER_PLANE_FLOATS], ints[owner + OWNER_PLANES]

@@ -7,16 +7,15 @@ ratios, azimuth and elevation, and its range is given by the box's ends. With th
 
 import math
 
-from numba import njit
-
 from hhsr.kernels.interval import product, signed
 from hhsr.kernels.spline import HALF_RANGE
 from hhsr.kernels.superquadric import p_norm
+from hhsr.kernels.unmanaged import unmanaged
 
 LN2 = math.log(2.0)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _cubic_range(c0, c1, c2, c3, x0, x1):
     """Return the range of a cubic on [x0, x1]: its ends and its extremes between them."""
     f0 = c0 + x0 * (c1 + x0 * (c2 + x0 * c3))
@@ -37,7 +36,7 @@ def _cubic_range(c0, c1, c2, c3, x0, x1):
     return lo, hi
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def exponent_range(coefficients, share0, share1):
     """Return (ε_lo, ε_hi, slope_lo, slope_hi) over shares [share0, share1] of the knots' range."""
     n = coefficients.shape[0]
@@ -60,7 +59,7 @@ def exponent_range(coefficients, share0, share1):
     return 1.0 + HALF_RANGE * g_lo, 1.0 + HALF_RANGE * g_hi, lo, hi
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _power_range(ratio_lo, ratio_hi, e_lo, e_hi):
     """Return the range of ratio^(2/ε)."""
     if ratio_lo <= 0.0:
@@ -76,20 +75,20 @@ def _power_range(ratio_lo, ratio_hi, e_lo, e_hi):
     return lo, hi
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _weight_range(s_lo, s_hi, e_lo, e_hi):
     """Return the range of S^−(1 − ε/2): ∂M/∂x of the p-norm, S = 1 + (y/x)^p."""
     return s_hi ** -(1.0 - 0.5 * e_lo), s_lo ** -(1.0 - 0.5 * e_hi)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _entropy(w):
     if w <= 0.0 or w >= 1.0:
         return 0.0
     return -w * math.log(w) - (1.0 - w) * math.log(1.0 - w)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _entropy_range(w_lo, w_hi):
     """Return the range of the binary entropy, concave with its top at 1/2."""
     h0, h1 = _entropy(w_lo), _entropy(w_hi)
@@ -97,12 +96,12 @@ def _entropy_range(w_lo, w_hi):
     return min(h0, h1), top
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _ratio(y, x):
     return y / x if x > 0.0 else (1e300 if y > 0.0 else 0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def norm_range(x0, x1, y0, y1, z0, z1, sx, sy, sz, half_axes, azimuth, elevation):
     """Return the ranges (N, ∂N/∂x, ∂N/∂y, ∂N/∂z) as eight floats over |x| ∈ [x0, x1] …, with signs sx, sy, sz = ±1.
 

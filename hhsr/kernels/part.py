@@ -3,10 +3,10 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.triangle_build import STACK
 from hhsr.kernels.triangles import inside_parity, nearest_triangle
+from hhsr.kernels.unmanaged import managed
 
 # Record, integers: float slots of the boxes (k, 6), integer slots of the links (k, 2), float slots of the corners
 # (n, 3, 3), their numbers, and the float slot of the longest side of the part's box.
@@ -14,7 +14,7 @@ BOXES, NODES, LINKS, CORNERS, TRIANGLES, EXTENT = 0, 1, 2, 3, 4, 5
 PART_INT_SIZE = 6
 
 
-@njit(cache=True, error_model="numpy")
+@managed
 def part_arrays(blob, ints, part):
     """Return the views (boxes, links, corners) that the triangle kernels take."""
     k, n = ints[part + NODES], ints[part + TRIANGLES]
@@ -26,7 +26,7 @@ def part_arrays(blob, ints, part):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@managed
 def part_contains(blob, ints, part, x, y, z):
     """Return whether the closed triangles hold the point."""
     if ints[part + TRIANGLES] == 0:
@@ -40,7 +40,7 @@ def part_contains(blob, ints, part, x, y, z):
     return inside_parity(boxes, links, corners, point, np.empty(STACK, dtype=np.int64))
 
 
-@njit(cache=True, error_model="numpy")
+@managed
 def part_field(blob, ints, part, x, y, z):
     """Return the signed distance to the part's triangles over the part's extent; 1 for an empty part."""
     if ints[part + TRIANGLES] == 0:

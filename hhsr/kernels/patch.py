@@ -6,7 +6,6 @@ A search is a float array: its slots hold the segment and the best point so far.
 import math
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.cell import cell_model, chart_of, direction_of, inverse_radius
 from hhsr.kernels.jet import has_jets, inverse_radius_jet
@@ -22,6 +21,7 @@ from hhsr.kernels.maps import (
     ray_thickness,
 )
 from hhsr.kernels.polygon import clip_polygon, polygon_to_segment
+from hhsr.kernels.unmanaged import unmanaged
 
 # Slots of a search: start 3, vector 3, squared length; best distance, t, point 3 (owner's frame); tolerance.
 START, VECTOR, LENGTH2, BEST, BEST_T, FOOT, TOLERANCE = 0, 3, 6, 7, 8, 9, 12
@@ -32,7 +32,7 @@ FAR = 1e150  # mm: no surface point found yet; finite, so that "no surface here"
 FINEST = 1e-5  # mm: a piece of surface smaller than this is taken as a point
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def distance_to(search, x, y, z):
     """Return (distance, t) of a point to the search's segment."""
     dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
@@ -44,7 +44,7 @@ def distance_to(search, x, y, z):
     return math.sqrt(rx * rx + ry * ry + rz * rz), t
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def offer(search, distance, t, x, y, z):
     """Take a surface point as the best one if it is nearer."""
     if distance < search[BEST]:
@@ -52,7 +52,7 @@ def offer(search, distance, t, x, y, z):
         search[FOOT], search[FOOT + 1], search[FOOT + 2] = x, y, z
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def offer_patch_point(blob, ints, leaf, planes, count, search, face, x, y, z, shrink):
     """Project a point near a patch along its ray to the exact surface and offer it, if it lies in the region.
 
@@ -79,7 +79,7 @@ def offer_patch_point(blob, ints, leaf, planes, count, search, face, x, y, z, sh
         x, y, z = sx - back * blob[at], sy - back * blob[at + 1], sz - back * blob[at + 2]
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def quick_bound(search, face, a, b, half, value, ga, gb, error):
     """Return a lower bound of a point's distance to a cell's surface: by its plane, and within it by its middle.
 
@@ -102,7 +102,7 @@ def quick_bound(search, face, a, b, half, value, ga, gb, error):
     return math.sqrt(low * low + aside * aside) if aside > 0.0 else low
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def cell_bound(blob, ints, leaf, planes, count, search, face, a, b, half, value, ga, gb, error, corners, spare):
     """Return a lower bound of the segment's distance to the cell's surface in the region; offer a point of it.
 
@@ -162,7 +162,7 @@ def cell_bound(blob, ints, leaf, planes, count, search, face, a, b, half, value,
     return low
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, corners, spare, rects):
     """Part a cell until what is left of it can hold no nearer point. rects: (NODE_ROOM, 6) scratch.
 

@@ -2,12 +2,12 @@
 
 import math
 
-from numba import njit
+from hhsr.kernels.unmanaged import unmanaged
 
 ROOM = 24  # corners: four, and one more for each clipping plane
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def clip_polygon(corners, count, spare, nx, ny, nz, limit):
     """Clip corners (ROOM, 3)[:count] to n·p ≤ limit, in place; return the new count, 0 where nothing is left."""
     crossed = False
@@ -41,7 +41,7 @@ def clip_polygon(corners, count, spare, nx, ny, nz, limit):
     return new
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def segment_to_segment(px, py, pz, dx, dy, dz, ax, ay, az, bx, by, bz):
     """Return (squared distance, t, s) between p + t·d and a + s·b, t and s in [0, 1]."""
     rx, ry, rz = px - ax, py - ay, pz - az
@@ -70,7 +70,7 @@ def segment_to_segment(px, py, pz, dx, dy, dz, ax, ay, az, bx, by, bz):
     return x * x + y * y + z * z, t, s
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _holds(corners, count, gx, gy, gz, x, y, z):
     """Return whether a point of the polygon's plane lies in the polygon, whichever way it turns."""
     left = right = False
@@ -86,7 +86,7 @@ def _holds(corners, count, gx, gy, gz, x, y, z):
     return not (left and right)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def polygon_to_segment(corners, count, gx, gy, gz, px, py, pz, dx, dy, dz):
     """Return (distance, t, x, y, z): of p + t·d, t in [0, 1], to the polygon in the plane g·x = 1, and its point.
 

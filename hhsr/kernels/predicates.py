@@ -8,6 +8,8 @@ even number of times.
 import numpy as np
 from numba import njit
 
+from hhsr.kernels.unmanaged import managed
+
 SPLITTER = 134217729.0  # 2^27 + 1
 DET2_BOUND = 3.3306690738754716e-16  # (3 + 16 u) u, u = 2^-53
 DET3_BOUND = 7.771561172376103e-16  # (7 + 56 u) u
@@ -57,7 +59,7 @@ def _sign_of_sum(total, count):
     return 1 if total[count - 1] > 0.0 else -1
 
 
-@njit(cache=True)
+@managed
 def _exact_det3(m):
     """Return the sign of the determinant of the (3, 3, 2) matrix of exact sums (value, rounding rest)."""
     total = np.empty(200)
@@ -89,7 +91,7 @@ def _exact_det3(m):
     return _sign_of_sum(total, count)
 
 
-@njit(cache=True)
+@managed
 def det3_sign(a, b, c, origin):
     """Return the exact sign (−1, 0, 1) of det(a − origin, b − origin, c − origin) of four points (3,)."""
     ax, ay, az = a[0] - origin[0], a[1] - origin[1], a[2] - origin[2]
@@ -112,7 +114,7 @@ def det3_sign(a, b, c, origin):
     return _exact_det3(m)
 
 
-@njit(cache=True)
+@managed
 def det2_sign(p, p0, q, q0, j, k):
     """Return the exact sign of u_j v_k − u_k v_j with u = p − p0, v = q − q0, of points (3,)."""
     uj, uk, vj, vk = p[j] - p0[j], p[k] - p0[k], q[j] - q0[j], q[k] - q0[k]

@@ -14,16 +14,16 @@ that is its line's distance, which is the segment's where no end is nearer.
 import math
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.cell import direction_of, inverse_radius
 from hhsr.kernels.jet import inverse_radius_bend
 from hhsr.kernels.layout import KINK, THIRD
 from hhsr.kernels.maps import outside_region
 from hhsr.kernels.patch import BEST, FINEST, LENGTH2, NODE_ROOM, START, TOLERANCE, VECTOR, distance_to, offer
+from hhsr.kernels.unmanaged import unmanaged
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _along_edge(c, linear, square, half):
     """Return (least, where) of c + linear·x + square·x² for |x| ≤ half."""
     x = -half if linear > 0.0 else half
@@ -32,7 +32,7 @@ def _along_edge(c, linear, square, half):
     return c + (linear + square * x) * x, x
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def least_over_square(c, ca, cb, aa, ab, bb, half):
     """Return (least, a, b) of c + ca·a + cb·b + aa·a² + 2·ab·a·b + bb·b² over |a|, |b| ≤ half."""
     det = aa * bb - ab * ab
@@ -54,7 +54,7 @@ def least_over_square(c, ca, cb, aa, ab, bb, half):
     return least, where_a, where_b
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def square_is_clear(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third):
     """Return (clear, δa, δb): no surface over the square about (a, b) lies within `radius` of the search's segment.
 
@@ -114,7 +114,7 @@ def square_is_clear(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, 
     return least > slack, da, db
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def settle_square(blob, ints, tab, leaf, planes, count, search, face, o, a, b, half, parting, rects):
     """Settle a cell with jets (leaf's frame): offer its nearest point, or prove that it holds none.
 

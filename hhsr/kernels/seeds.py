@@ -7,6 +7,7 @@ import numpy as np
 from numba import njit
 
 from hhsr.kernels.layout import SEED_CELLS, SEED_FRAME, SEEDS
+from hhsr.kernels.unmanaged import unmanaged
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -50,14 +51,14 @@ def fill_seeds(centres, low, side, out):
                     out[i, j, k] = best
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _away2(centres, q, low, side, i, j, k):
     """Return the squared distance of a facet's centre to that of a cell."""
     x, y, z = low[0] + side * (i + 0.5), low[1] + side * (j + 0.5), low[2] + side * (k + 0.5)
     return (centres[q, 0] - x) ** 2 + (centres[q, 1] - y) ** 2 + (centres[q, 2] - z) ** 2
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def seed_at(blob, ints, x, y, z):
     """Return the facet named by the cell that holds a point of the tree's frame, or by the cell nearest to it."""
     c, f = ints[SEED_CELLS], ints[SEED_FRAME]

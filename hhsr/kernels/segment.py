@@ -9,7 +9,6 @@ bound settles are settled by their ends.
 import math
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.cell import cell_model, chart_of, inverse_radius
 from hhsr.kernels.jet import has_jets, inverse_radius_jet
@@ -27,12 +26,13 @@ from hhsr.kernels.layout import (
 )
 from hhsr.kernels.maps import bend_over, cell_at, level_start
 from hhsr.kernels.solve import share_to_t, solve_in_cell
+from hhsr.kernels.unmanaged import managed, unmanaged
 
 PIECES = 64  # depth of the bisection
 UNDECIDED = 2
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def emit(state, new, t, out, count):
     """Record a change of state at t; return (state, count). A count above out.size says how much room is needed."""
     if state != new:
@@ -42,7 +42,7 @@ def emit(state, new, t, out, count):
     return state, count
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def clip_to_box(box_lo, box_hi, p, d, t0, t1):
     """Return the interval of t in [t0, t1] in which one coordinate p + t·d lies in [lo, hi]."""
     if d == 0.0:
@@ -55,7 +55,7 @@ def clip_to_box(box_lo, box_hi, p, d, t0, t1):
     return max(t0, a), min(t1, b)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _range_of(tab, ints, leaf, face, side, i0, i1, j0, j1):
     """Return (lo, hi) of W over pyramid nodes i0 … i1, j0 … j1 of a level."""
     lo, hi = np.float32(1e30), np.float32(0.0)
@@ -67,12 +67,12 @@ def _range_of(tab, ints, leaf, face, side, i0, i1, j0, j1):
     return lo, hi
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _index(x, side):
     return min(max(int((x + 1.0) * 0.5 * side), 0), side - 1)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _border(a0, b0, a1, b1, side):
     """Return the share at which a piece meets the middle one of the cell borders in it; −1 within one cell."""
     i0, i1 = _index(a0, side), _index(a1, side)
@@ -88,7 +88,7 @@ def _border(a0, b0, a1, b1, side):
     return -1.0
 
 
-@njit(cache=True, error_model="numpy")
+@managed
 def leaf_crossings(
     blob, ints, tab, leaf, px, py, pz, dx, dy, dz, t0, t1, resolution, tolerance, state, out, count, work
 ):
@@ -192,7 +192,7 @@ def leaf_crossings(
     return state, count
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _face_crossings(
     blob, ints, tab, leaf, face, px, py, pz, dx, dy, dz, ta, tb, speed, resolution, tolerance, state, out, count, work
 ):
@@ -277,7 +277,7 @@ def _face_crossings(
         t1, a1, b1, w1 = work[depth, 4], work[depth, 5], work[depth, 6], work[depth, 7]
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _settle(
     blob, ints, leaf, face, t0, a0, b0, w0, t1, a1, b1, w1,
     ca, cb, value, ga, gb, error, sa, sb, last, speed, resolution, tolerance, state, out, count,

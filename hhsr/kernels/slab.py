@@ -2,9 +2,8 @@
 
 import math
 
-from numba import njit
-
 from hhsr.kernels.leaf import contour_radius
+from hhsr.kernels.unmanaged import unmanaged
 
 # Slab record, integers: float slot of the frame (rows e1, e2, n, then offset, half width), number of lobes, integer
 # slot of the lobes' records.
@@ -19,7 +18,7 @@ LOBE_INT_SIZE = 9
 TABLE = 256
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def lobe_contour(blob, ints, lobe, cosine, sine):
     """Return C(α), the radius of the fitted contour in direction (cos α, sin α)."""
     axes, n, k = ints[lobe + LOBE_AXES], ints[lobe + LOBE_SEGMENTS], ints[lobe + LOBE_COUNT_CENTRES]
@@ -35,7 +34,7 @@ def lobe_contour(blob, ints, lobe, cosine, sine):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def lobe_ends(blob, ints, lobe, angle):
     """Return (L, R) at an angle in [−π, π]: linear between the 256 exact section radii."""
     share = (angle / (2.0 * math.pi) + 0.5) * TABLE
@@ -47,7 +46,7 @@ def lobe_ends(blob, ints, lobe, angle):
     return left, blob[o] + x * (blob[o + 1] - blob[o])
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def lobe_radius(blob, ints, lobe, du, dv, t):
     """Return r(α, t) ≥ 0 in the in-plane direction (du, dv), t ∈ [0, 1] from h = −d to h = d."""
     length = math.sqrt(du * du + dv * dv)
@@ -59,7 +58,7 @@ def lobe_radius(blob, ints, lobe, du, dv, t):
     return max(u * u * left + 2.0 * t * u * middle + t * t * right, 0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def slab_coordinates(blob, frame, x, y, z):
     """Return (u, v, t) of a point of the tree's frame: in-plane coordinates, and height as t ∈ [0, 1] in the slab."""
     f = frame
@@ -69,13 +68,13 @@ def slab_coordinates(blob, frame, x, y, z):
     return u, v, min(max(0.5 * (h / blob[f + 10] + 1.0), 0.0), 1.0)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def slab_contains(blob, ints, slab, x, y, z):
     """Return whether some lobe of the slab holds a point of the tree's frame."""
     return slab_field(blob, ints, slab, x, y, z) <= 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def slab_field(blob, ints, slab, x, y, z):
     """Return the least (|p∥ − c| − r)/r over the lobes; 1e9 where every r is 0."""
     u, v, t = slab_coordinates(blob, ints[slab + SLAB_FRAME], x, y, z)

@@ -21,12 +21,13 @@ from hhsr.kernels.slab import (
     TABLE,
     lobe_contour,
 )
+from hhsr.kernels.unmanaged import unmanaged
 
 STEP = 2.0 * math.pi / TABLE
 MAX_SCALE = 0.95
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def circle_scale_range(blob, ints, lobe, angle, half):
     """Return (s_lo, s_hi, s'_lo, s'_hi) of the contour's scale field over angle ± half, by each centre's own range."""
     k = ints[lobe + LOBE_COUNT_CENTRES]
@@ -62,7 +63,7 @@ def circle_scale_range(blob, ints, lobe, angle, half):
     return min(value - reach, MAX_SCALE), min(value + reach, MAX_SCALE), lo, hi
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def contour_range(blob, ints, lobe, angle, half):
     """Return (C, C_lo, C_hi, C'_lo, C'_hi) over angle ± half, a piece of one quadrant; C at the angle itself."""
     n = ints[lobe + LOBE_SEGMENTS]
@@ -97,7 +98,7 @@ def contour_range(blob, ints, lobe, angle, half):
     return middle, low - grow, high + grow, g_lo - grow, g_hi + grow
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def lobe_model(blob, ints, lobe, segment, angle, t, half, half_t):
     """Return (r, r_α, r_t, error, lo, hi): r within ± error of its linear model over angle ± half, t ± half_t.
 
@@ -134,7 +135,7 @@ def lobe_model(blob, ints, lobe, segment, angle, t, half, half_t):
     return value, slope_a, slope_t, error, value - reach, value + reach
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _weight(t0, t1, left):
     """Return the range of (1 − t)(1 − 2t), or of t (2t − 1), over [t0, t1]."""
     if left:
@@ -144,7 +145,7 @@ def _weight(t0, t1, left):
     return (low if t0 <= turn <= t1 else min(a, b)), max(a, b)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def lobe_range(blob, ints, lobe, angle0, angle1, t0, t1):
     """Return the range of r over [angle0, angle1] (within [−π, π], spanning few segments) and [t0, t1]."""
     lo, hi = 1e300, -1e300
@@ -186,7 +187,7 @@ def fill_lobe_spheres(blob, ints, slab, lobe, spheres):
         spheres[segment, 4], spheres[segment, 5] = lo, hi
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def lobe_limits(blob, ints, lobe):
     """Return the least and the greatest r of a lobe."""
     o = ints[lobe + LOBE_SPHERES]

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.segment import PIECES, emit
 from hhsr.kernels.slab import (
@@ -17,11 +16,12 @@ from hhsr.kernels.slab import (
     lobe_radius,
 )
 from hhsr.kernels.slab_bounds import STEP, lobe_range
+from hhsr.kernels.unmanaged import unmanaged
 
 WIDEST = 4.0 * STEP
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _lobe_verdict(blob, ints, lobe, u, v, du, dv, s0, s1, h0, h1):
     """Return 1 where the piece [s0, s1] of (u, v) + s·(du, dv) lies in the lobe, 0 outside, 2 where not proven."""
     o = ints[lobe + LOBE_TABLES]
@@ -57,7 +57,7 @@ def _lobe_verdict(blob, ints, lobe, u, v, du, dv, s0, s1, h0, h1):
     return 1 if far < low - grow else 2
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def _inside(blob, ints, slab, u, v, t):
     for k in range(ints[slab + LOBE_COUNT]):
         lobe = ints[slab + LOBES] + LOBE_INT_SIZE * k
@@ -69,7 +69,7 @@ def _inside(blob, ints, slab, u, v, t):
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def slab_crossings(blob, ints, slab, px, py, pz, dx, dy, dz, t0, t1, resolution, tolerance, state, out, count, work):
     """Follow p + t·d (tree's frame) for t in [t0, t1]; return (state, count), having recorded each change of state."""
     f = ints[slab + SLAB_FRAME]

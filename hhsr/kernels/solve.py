@@ -1,11 +1,10 @@
 """One crossing in a piece where a proof says that there is exactly one: its place, by exact values."""
 
-from numba import njit
-
 from hhsr.kernels.cell import inverse_radius
+from hhsr.kernels.unmanaged import unmanaged
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def solve_in_cell(blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, x0, x1, f0, f1, slope, steep, tolerance):
     """Return the share x in [x0, x1] where w = W: Newton on the proven slope, safeguarded by the bracket.
 
@@ -36,7 +35,7 @@ def solve_in_cell(blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, x0, x1, f0, f1
     return 0.5 * (lo + hi)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def share_to_t(x, t0, t1, w0, w1):
     """Return t of the point at share x of a piece in the chart: t is linear in space, x in the projection."""
     p, q = (1.0 - x) * w0, x * w1

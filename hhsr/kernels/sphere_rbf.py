@@ -137,3 +137,22 @@ def gaussian_bend(cm, ca, cb, inverse_extents, weights, um, ua, ub, q):
     bb -= q * (2.0 * first_b * ub + along * q * (1.0 - ub * ub))
     ab -= q * (first_b * ua + first_a * ub - along * q * ua * ub)
     return total, first_a, first_b, aa, ab, bb
+
+
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, forceinline=True)
+def gaussian_along(cx, cy, cz, inverse_extents, weights, ux, uy, uz, vx, vy, vz):
+    """Return (s, ds) of a unit direction u over rows of centres: its value, and its change along a tangent vector v."""
+    total = slope = 0.0
+    for j in range(weights.shape[0]):
+        h = min((1.0 - (ux * cx[j] + uy * cy[j] + uz * cz[j])) * inverse_extents[j], 1.0)
+        t = 2.0 * h - 1.0
+        t2 = t * t
+        t4 = t2 * t2
+        low = ((_P0 + _P1 * t) + (_P2 + _P3 * t) * t2) + ((_P4 + _P5 * t) + (_P6 + _P7 * t) * t2) * t4
+        root = low + ((_P8 + _P9 * t) + (_P10 + _P11 * t) * t2) * (t4 * t4)
+        quarter = root * root
+        rest = 1.0 - h
+        e = weights[j] * (quarter * quarter * _MIDDLE) * rest
+        total += e * rest
+        slope += e * inverse_extents[j] * (4.0 * rest + 2.0) * (vx * cx[j] + vy * cy[j] + vz * cz[j])
+    return total, slope

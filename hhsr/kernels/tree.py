@@ -30,9 +30,10 @@ from hhsr.kernels.layout import (
 from hhsr.kernels.maps import cell_at
 from hhsr.kernels.part import part_contains, part_field
 from hhsr.kernels.slab import slab_contains, slab_field
+from hhsr.kernels.unmanaged import unmanaged
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def into_tree(blob, ints, x, y, z):
     """Return an LPS point in the tree's frame."""
     o = ints[POSE]
@@ -44,7 +45,7 @@ def into_tree(blob, ints, x, y, z):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def out_of_tree(blob, ints, x, y, z):
     """Return a point of the tree's frame in LPS."""
     o = ints[POSE]
@@ -55,7 +56,7 @@ def out_of_tree(blob, ints, x, y, z):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def into_leaf(blob, ints, leaf, x, y, z):
     """Return a point of the tree's frame in the leaf's frame."""
     o = ints[leaf + FRAME]
@@ -65,7 +66,7 @@ def into_leaf(blob, ints, leaf, x, y, z):
     return turn_into_leaf(blob, o, x, y, z)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def turn_into_leaf(blob, frame, x, y, z):
     """Return a vector of the tree's frame in the frame whose numbers start at `frame`."""
     return (
@@ -75,7 +76,7 @@ def turn_into_leaf(blob, frame, x, y, z):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def turn_out_of_leaf(blob, frame, x, y, z):
     """Return a vector of a leaf's frame in the tree's frame."""
     return (
@@ -85,7 +86,7 @@ def turn_out_of_leaf(blob, frame, x, y, z):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def owner_of(blob, ints, root, x, y, z):
     """Return the index of the owner, below node `root`, of the region that holds a point of the tree's frame."""
     node = root
@@ -100,7 +101,7 @@ def owner_of(blob, ints, root, x, y, z):
         node = ints[i + 2] if h >= 0.0 else ints[i + 1]
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def leaf_contains(blob, ints, tab, leaf, x, y, z):
     """Return whether a model leaf holds a point of its frame: by its map, where undecided by the exact formula."""
     if x == 0.0 and y == 0.0 and z == 0.0:
@@ -115,7 +116,7 @@ def leaf_contains(blob, ints, tab, leaf, x, y, z):
     return leaf_implicit(blob, ints, leaf, x, y, z) <= 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def owner_contains(blob, ints, tab, owner, x, y, z):
     """Return whether an owner's solid holds a point of the tree's frame, by the owner's own formula."""
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
@@ -128,13 +129,13 @@ def owner_contains(blob, ints, tab, owner, x, y, z):
     return slab_contains(blob, ints, record, x, y, z)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def contains_point(blob, ints, tab, root, x, y, z):
     """Return whether the solid of node `root` holds a point of the tree's frame; on the surface is inside."""
     return owner_contains(blob, ints, tab, owner_of(blob, ints, root, x, y, z), x, y, z)
 
 
-@njit(cache=True, error_model="numpy")
+@unmanaged
 def field_point(blob, ints, x, y, z):
     """Return the implicit value at a point of the tree's frame: G of a leaf, gap/r in a slab, distance/extent."""
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner_of(blob, ints, 0, x, y, z)

@@ -1,0 +1,153 @@
+"""Where a straight line crosses one leaf's own function F = N/(1 − s), along a stretch over which its bend is known.
+
+One exact value and slope at t, and a bound B of the second derivative along the line, hold F between two parabolas:
+they settle most stretches at once, and one Newton step from there leaves no more than B·Δ²/2.
+"""
+
+import math
+
+from hhsr.kernels.cell import axis_scale, block_of, face_of, norm_at, scale_in_block
+from hhsr.kernels.layout import BLOCK_DATA, BLOCK_ROWS, BLOCKS, HALF_AXES
+from hhsr.kernels.leaf import MAX_SCALE
+from hhsr.kernels.sphere_rbf import gaussian_along
+from hhsr.kernels.unmanaged import inlined, unmanaged
+
+PIECES = 64  # depth of the bisection
+
+
+@inlined
+def change(state, new, t, gap, out, count):
+    """Record a change of state at t, or drop the last where it is within `gap`: a touch; return (state, count).
+
+    A count above out.size says how much room is needed.
+    """
+    if state != new:
+        if 0 < count <= out.shape[0] and t - out[count - 1] <= gap:
+            return new, count - 1
+        if count < out.shape[0]:
+            out[count] = t
+        return new, count + 1
+    return state, count
+
+
+@unmanaged
+def excess(blob, ints, leaf, x, y, z):
+    """Return F − 1 at a point of the leaf's frame by the exact formula: ≤ 0 inside."""
+    length = math.sqrt(x * x + y * y + z * z)
+    if length == 0.0:
+        return -1.0
+    face, a, b, _ = face_of(x, y, z)
+    s = scale_in_block(blob, ints, leaf, block_of(face, a, b), x / length, y / length, z / length)
+    return norm_at(blob, ints, leaf, x, y, z) / (1.0 - min(s, MAX_SCALE)) - 1.0
+
+
+@inlined
+def excess_along(blob, ints, leaf, x, y, z, dx, dy, dz):
+    """Return (F − 1, ∂F/∂d) at a point of the frame of a leaf with an ellipsoid for a base, where nothing is capped."""
+    inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
+    ux, uy, uz = x * inverse, y * inverse, z * inverse
+    face, a, b, _ = face_of(x, y, z)
+    start = ints[leaf + BLOCKS] + block_of(face, a, b)
+    o = ints[leaf + BLOCK_DATA] + ints[start]
+    n = (ints[start + 1] - ints[start]) // BLOCK_ROWS
+    radial = dx * ux + dy * uy + dz * uz
+    s, ds = gaussian_along(
+        blob[o : o + n], blob[o + n : o + 2 * n], blob[o + 2 * n : o + 3 * n], blob[o + 3 * n : o + 4 * n],
+        blob[o + 4 * n : o + 5 * n], ux, uy, uz,
+        (dx - radial * ux) * inverse, (dy - radial * uy) * inverse, (dz - radial * uz) * inverse,
+    )  # fmt: skip
+    h = ints[leaf + HALF_AXES]
+    cx, cy, cz = axis_scale(blob, h, 0, x), axis_scale(blob, h, 2, y), axis_scale(blob, h, 4, z)
+    norm = math.sqrt(cx * x * x + cy * y * y + cz * z * z)
+    d = 1.0 / (1.0 - s)
+    f = norm * d
+    return f - 1.0, ((cx * x * dx + cy * y * dy + cz * z * dz) / norm + f * ds) * d
+
+
+@unmanaged
+def root_in(blob, ints, leaf, px, py, pz, dx, dy, dz, lo, hi, guess, rises, least, most, bend, tolerance):
+    """Return t in [lo, hi] where F = 1 on p + t·d (leaf's frame), to the tolerance (of t).
+
+    F is proven to cross 1 once there, rising or falling; least, most: bounds of |dF/dt|; bend: of |d²F/dt²|, infinite
+    where only values may be asked.
+    """
+    smooth = bend < math.inf
+    mean, spread = 0.5 * (least + most), 0.5 * (most - least)
+    t = guess
+    for turn in range(100):
+        t = min(max(t, lo), hi)
+        x, y, z = px + t * dx, py + t * dy, pz + t * dz
+        if smooth:
+            f, slope = excess_along(blob, ints, leaf, x, y, z, dx, dy, dz)
+            if not rises:
+                f, slope = -f, -slope
+            steep = max(slope - bend * (hi - lo), least, 1e-30)
+            far = abs(f) / steep
+            if 0.5 * bend * far * far <= tolerance * steep:
+                return min(max(t - f / max(slope, steep), lo), hi)
+            step = f / max(slope, steep)
+        else:
+            f = excess(blob, ints, leaf, x, y, z)
+            if not rises:
+                f = -f
+            if abs(f) <= least * tolerance:
+                return t
+            if abs(f) * spread <= tolerance * mean * least:
+                return min(max(t - f / mean, lo), hi)
+            step = f / mean
+        if f < 0.0:
+            lo = t
+        else:
+            hi = t
+        if hi - lo <= tolerance:
+            break
+        t -= step
+        if not lo < t < hi or turn % 3 == 2:
+            t = 0.5 * (lo + hi)
+    return 0.5 * (lo + hi)
+
+
+@unmanaged
+def settle_stretch(
+    blob, ints, leaf, px, py, pz, dx, dy, dz, a, b, bend, resolution, tolerance, gap, state, out, count, work
+):
+    """Follow F along p + t·d (leaf's frame), t in [a, b], over which `bend` (finite) holds; return (state, count).
+
+    resolution, tolerance, gap: of t. A piece shorter than the resolution that no proof settles is settled by its ends.
+    work: (PIECES, …) scratch.
+    """
+    depth = 0
+    end = b
+    while True:
+        t, half = 0.5 * (a + b), 0.5 * (b - a)
+        f, slope = excess_along(blob, ints, leaf, px + t * dx, py + t * dy, pz + t * dz, dx, dy, dz)
+        stray = 0.5 * bend * half * half * (1.0 + 1e-9) + 1e-11
+        split = False
+        if abs(f) > abs(slope) * half + stray:
+            state, count = change(state, f < 0.0, a, gap, out, count)
+        elif abs(slope) > bend * half * (1.0 + 1e-9) or b - a <= resolution or depth == PIECES:
+            # One crossing at most (or no room for two): the states at the ends, by the parabolas or by exact values.
+            f0, f1 = f - slope * half, f + slope * half
+            if abs(f0) <= stray:
+                f0 = excess(blob, ints, leaf, px + a * dx, py + a * dy, pz + a * dz)
+            if abs(f1) <= stray:
+                f1 = excess(blob, ints, leaf, px + b * dx, py + b * dy, pz + b * dz)
+            state, count = change(state, f0 <= 0.0, a, gap, out, count)
+            if (f0 <= 0.0) != (f1 <= 0.0):
+                least = max(abs(slope) - bend * half, 0.0)
+                t = root_in(
+                    blob, ints, leaf, px, py, pz, dx, dy, dz, a, b, t - f / slope if slope != 0.0 else t,
+                    f1 > 0.0, least, abs(slope) + bend * half, bend, tolerance,
+                )  # fmt: skip
+                state, count = change(state, f1 <= 0.0, t, gap, out, count)
+        else:
+            split = True
+        if split:
+            work[depth, 0] = b
+            depth += 1
+            b = t
+            continue
+        if depth == 0 or b >= end:
+            return state, count
+        depth -= 1
+        a, b = b, work[depth, 0]

@@ -1,0 +1,279 @@
+"""A segment's walk through the voxels: leaps over what is proven, planes at the surface, runs of what is left.
+
+A run is a stretch that no plane decides. Where the planes prove F monotone along it, it holds one crossing if the
+states at its ends differ and none else; where they only bound its bend, parabolas settle it; where a cut, a band or
+a retained part is near, the stretch is clipped down the tree.
+"""
+
+import math
+
+import numpy as np
+
+from hhsr.kernels.cell import leaf_implicit
+from hhsr.kernels.clipped import follow_tree, merge_touches
+from hhsr.kernels.layout import (
+    FRAME,
+    NODE_FLOAT_SIZE,
+    NODE_FLOATS,
+    OWNER_INT_SIZE,
+    OWNER_INTS,
+    OWNER_RECORD,
+    ROTATED,
+    VOXEL_FRAME,
+    VOXELS,
+)
+from hhsr.kernels.stretch import PIECES, change, root_in, settle_stretch
+from hhsr.kernels.surfel import BEND, DETAIL_SIZE, EXTRA, OFFSET, PLANE_SIZE, SURFEL_OWNER, THICK, TURN
+from hhsr.kernels.tree import into_leaf, turn_into_leaf
+from hhsr.kernels.unmanaged import inlined, unmanaged
+from hhsr.kernels.voxels import (
+    BASES,
+    BRICK,
+    BRICK_PLANES,
+    BRICKS,
+    BYTES,
+    DETAILS,
+    IN_BYTE,
+    LEAPS,
+    NO_SURFEL,
+    PLANES,
+    solid_contains,
+)
+
+NUDGE = 1e-7  # mm (and voxels) past a voxel's border: less than voxels and planes are proven beyond theirs
+STILL = 1e-12  # voxels: along an axis, a segment that moves less stays where it is
+UNKNOWN = 2
+NONE, MONOTONE, BENT, CLIPPED = 0, 1, 2, 3  # kinds of runs: what is proven along one
+# A run, in the last row of the scratch: from which t, its owner, the sign of dF/dt, the least and greatest |dF/dt|,
+# |d²F/dt²|, and where F is about 1.
+RUN, RUN_START, RUN_OWNER, RUN_SIGN, RUN_LEAST, RUN_MOST, RUN_BEND, RUN_GUESS = PIECES, 0, 1, 2, 3, 4, 5, 6
+
+
+@unmanaged
+def _close_run(
+    blob, ints, tab, kind, px, py, pz, dx, dy, dz, length, end, new, resolution, tolerance, gap, state, out, count,
+    work, slots, pending,
+):  # fmt: skip
+    """Settle the pending run, which ends at t = `end` in the state `new`; return (state, count)."""
+    begin = work[RUN, RUN_START]
+    if kind == MONOTONE and state == new:
+        return state, count
+    if kind == CLIPPED:
+        state, count, _ = follow_tree(
+            blob, ints, tab, 0, px, py, pz, dx, dy, dz, begin, end, gap, resolution, tolerance, False, state, out,
+            count, work, slots, pending,
+        )  # fmt: skip
+        state, count = change(state, new, end, gap, out, count)
+        return state, merge_touches(out, count, gap)
+    leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * int(work[RUN, RUN_OWNER]) + OWNER_RECORD]
+    px, py, pz = into_leaf(blob, ints, leaf, px, py, pz)
+    if ints[leaf + ROTATED] != 0:
+        dx, dy, dz = turn_into_leaf(blob, ints[leaf + FRAME], dx, dy, dz)
+    bend = work[RUN, RUN_BEND]
+    if kind == MONOTONE:
+        end = root_in(
+            blob, ints, leaf, px, py, pz, dx, dy, dz, begin, end, work[RUN, RUN_GUESS], work[RUN, RUN_SIGN] > 0.0,
+            work[RUN, RUN_LEAST], work[RUN, RUN_MOST], bend, tolerance / length,
+        )  # fmt: skip
+    else:
+        state, count = settle_stretch(
+            blob, ints, leaf, px, py, pz, dx, dy, dz, begin, end, bend, resolution / length, tolerance / length, gap,
+            state, out, count, work,
+        )  # fmt: skip
+    return change(state, new, end, gap, out, count)
+
+
+@unmanaged
+def _holds(blob, ints, owner, x, y, z):
+    """Return whether a model leaf holds a point of the tree's frame, by the exact formula."""
+    leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * owner + OWNER_RECORD]
+    x, y, z = into_leaf(blob, ints, leaf, x, y, z)
+    return leaf_implicit(blob, ints, leaf, x, y, z) <= 0.0
+
+
+@inlined
+def _enter(kind, work, a, b, owner, slope, stray, bend, guess):
+    """Add [a, b] of a voxel to the run, or begin one; return the run's kind. Owner −1: a voxel without a surfel."""
+    new = CLIPPED if owner < 0 else (MONOTONE if abs(slope) > stray else (BENT if bend < np.inf else CLIPPED))
+    if kind == NONE:
+        work[RUN, RUN_START], work[RUN, RUN_OWNER], work[RUN, RUN_SIGN] = a, owner, slope
+        work[RUN, RUN_LEAST], work[RUN, RUN_MOST] = abs(slope) - stray, abs(slope) + stray
+        work[RUN, RUN_BEND], work[RUN, RUN_GUESS] = bend, guess
+        return new
+    if kind == CLIPPED or new == CLIPPED or work[RUN, RUN_OWNER] != owner:
+        return CLIPPED
+    work[RUN, RUN_BEND] = max(work[RUN, RUN_BEND], bend)
+    if kind == MONOTONE and new == MONOTONE and (work[RUN, RUN_SIGN] > 0.0) == (slope > 0.0):
+        work[RUN, RUN_LEAST] = min(work[RUN, RUN_LEAST], abs(slope) - stray)
+        work[RUN, RUN_MOST] = max(work[RUN, RUN_MOST], abs(slope) + stray)
+        if guess >= a:  # the plane of this voxel is the one that the crossing lies on, or past
+            work[RUN, RUN_GUESS] = guess
+        return MONOTONE
+    return BENT if work[RUN, RUN_BEND] < np.inf else CLIPPED
+
+
+@inlined
+def _clip(u, v, size, t0, t1):
+    """Return the interval of t in [t0, t1] in which u + t·v lies in [0, size]."""
+    if abs(v) < STILL:
+        return (t0, t1) if 0.0 <= u <= size else (1.0, 0.0)
+    a, b = -u / v, (size - u) / v
+    if a > b:
+        a, b = b, a
+    return max(t0, a), min(t1, b)
+
+
+@unmanaged
+def follow_voxels(
+    blob, ints, tab, px, py, pz, qx, qy, qz, length, gap, resolution, tolerance, first, out, work, slots, pending
+):
+    """Return (start state, count) of p → q (tree's frame): `hhsr.kernels.crossing.follow_segment`."""
+    dx, dy, dz = qx - px, qy - py, qz - pz
+    octets, words = blob.view(np.uint8), blob.view(np.int32)
+    c, f = ints[VOXELS], ints[VOXEL_FRAME]
+    nx, ny, nz = ints[c], ints[c + 1], ints[c + 2]
+    bricks, bases, voxels = ints[c + BRICKS], ints[c + BASES], ints[c + BYTES]
+    brick_planes, planes, details = ints[c + BRICK_PLANES], ints[c + PLANES], ints[c + DETAILS]
+    scale = blob[f + 4]
+    # All in voxels from here on: u + t·v.
+    ux, uy, uz = (px - blob[f]) * scale, (py - blob[f + 1]) * scale, (pz - blob[f + 2]) * scale
+    vx, vy, vz = dx * scale, dy * scale, dz * scale
+    top_x, top_y, top_z = BRICK * nx, BRICK * ny, BRICK * nz
+    start, stop = _clip(ux, vx, float(top_x), 0.0, 1.0)
+    start, stop = _clip(uy, vy, float(top_y), start, stop)
+    start, stop = _clip(uz, vz, float(top_z), start, stop)
+    if not start < stop:
+        return False, 0
+    # Along an axis the border at x is met at x·i + k; a still axis never is.
+    ix = 1.0 / vx if abs(vx) >= STILL else 0.0
+    iy = 1.0 / vy if abs(vy) >= STILL else 0.0
+    iz = 1.0 / vz if abs(vz) >= STILL else 0.0
+    kx = -ux * ix if abs(vx) >= STILL else np.inf
+    ky = -uy * iy if abs(vy) >= STILL else np.inf
+    kz = -uz * iz if abs(vz) >= STILL else np.inf
+    sx, sy, sz = (1 if vx >= 0.0 else -1), (1 if vy >= 0.0 else -1), (1 if vz >= 0.0 else -1)
+    ox, oy, oz = (1 - sx) >> 1, (1 - sy) >> 1, (1 - sz) >> 1
+    octant = (1 - ox) + 2 * (1 - oy) + 4 * (1 - oz)
+    leaps = ints[c + LEAPS] + octant * (nx * ny * nz)
+    nudge = max(NUDGE * min(1.0, blob[f + 3]) / length, 1e-15)
+    speed = math.sqrt(vx * vx + vy * vy + vz * vz)
+    t = start + nudge if start > 0.0 else 0.0
+    begin = start <= 0.0 and solid_contains(blob, ints, tab, 0, px, py, pz)
+    state, count = begin, 0
+    kind, closing, at, last = NONE, UNKNOWN, 0.0, -1
+    while True:
+        if closing != UNKNOWN:
+            state, count = _close_run(
+                blob, ints, tab, kind, px, py, pz, dx, dy, dz, length, at, closing == 1, resolution, tolerance, gap,
+                state, out, count, work, slots, pending,
+            )  # fmt: skip
+            kind, closing = NONE, UNKNOWN
+        if first and count > 0 and (t if kind == NONE else work[RUN, RUN_START]) > out[0] + gap:
+            return begin, count
+        if t >= stop:
+            # The end has its own state: along a cutting plane it may not be the one that the walk came with.
+            holds = stop >= 1.0 and solid_contains(blob, ints, tab, 0, qx, qy, qz)
+            if kind == NONE:
+                state, count = change(state, holds, stop, gap, out, count)
+                return begin, count
+            closing, at = (1 if holds else 0), stop
+            continue
+        x, y, z = ux + t * vx, uy + t * vy, uz + t * vz
+        i, j, k = min(max(int(x), 0), top_x - 1), min(max(int(y), 0), top_y - 1), min(max(int(z), 0), top_z - 1)
+        bi, bj, bk = i >> 2, j >> 2, k >> 2
+        brick = (bi * ny + bj) * nz + bk
+        leap = np.int64(octets[leaps + brick])
+        known, surfel, near = UNKNOWN, -1, np.inf
+        if leap != 0:
+            known = 1 if leap < 128 else 0
+            r = leap if leap < 128 else 256 - leap
+            ex = ((bi + sx * r + ox) << 2) * ix + kx
+            ey = ((bj + sy * r + oy) << 2) * iy + ky
+            ez = ((bk + sz * r + oz) << 2) * iz + kz
+        else:
+            slot = np.int64(words[bricks + brick])
+            o = brick_planes + PLANE_SIZE * slot
+            gx, gy, gz = np.float64(tab[o]), np.float64(tab[o + 1]), np.float64(tab[o + 2])
+            l0 = gx * (x - ((i | 3) - 1)) + gy * (y - ((j | 3) - 1)) + gz * (z - ((k | 3) - 1)) + tab[o + OFFSET]
+            if abs(l0) > 1.0:
+                # The brick's own plane decides, up to where the segment comes near it.
+                known = 1 if l0 < 0.0 else 0
+                slope = gx * vx + gy * vy + gz * vz
+                if (l0 > 0.0) != (slope > 0.0) and slope != 0.0:
+                    near = t + (abs(l0) - 1.0) / abs(slope)
+                ex = ((bi + sx + ox) << 2) * ix + kx
+                ey = ((bj + sy + oy) << 2) * iy + ky
+                ez = ((bk + sz + oz) << 2) * iz + kz
+            else:
+                byte = np.int64(octets[voxels + 64 * slot + (((i & 3) << 4) | ((j & 3) << 2) | (k & 3))])
+                if byte > NO_SURFEL:
+                    known = 1 if byte == IN_BYTE else 0
+                elif byte < NO_SURFEL:
+                    surfel = np.int64(words[bases + slot]) + byte
+                ex = (i + sx + ox) * ix + kx
+                ey = (j + sy + oy) * iy + ky
+                ez = (k + sz + oz) * iz + kz
+        end = min(min(ex, ey), min(min(ez, near), stop))
+        a, b, after, owner, cut = t, end, UNKNOWN, -1, False
+        slope = stray = bend = guess = 0.0
+        if surfel >= 0:
+            if math.isnan(tab[planes + PLANE_SIZE * surfel + OFFSET]):
+                # A cut passes: the side that t is on, and no farther than the cut.
+                cut = True
+                o = details + DETAIL_SIZE * surfel
+                n = ints[NODE_FLOATS] + NODE_FLOAT_SIZE * (-1 - int(tab[o + SURFEL_OWNER]))
+                h = blob[n] * px + blob[n + 1] * py + blob[n + 2] * pz - blob[n + 3]
+                g = blob[n] * dx + blob[n + 1] * dy + blob[n + 2] * dz
+                right = h >= 0.0
+                if g != 0.0:
+                    meet = -h / g
+                    right = (t >= meet) == (g > 0.0)
+                    if t < meet:
+                        end = min(end, meet)
+                surfel = int(tab[o + EXTRA]) + (1 if right else 0)
+            o = planes + PLANE_SIZE * surfel
+            gx, gy, gz = np.float64(tab[o]), np.float64(tab[o + 1]), np.float64(tab[o + 2])
+            slope = gx * vx + gy * vy + gz * vz
+            l0 = gx * (x - i - 0.5) + gy * (y - j - 0.5) + gz * (z - k - 0.5) + tab[o + OFFSET]
+            l1 = l0 + slope * (end - t)
+            b = end
+            if abs(l0) > 1.0:
+                known = 1 if l0 < 0.0 else 0
+            if abs(l1) > 1.0:
+                after = 1 if l1 < 0.0 else 0
+            decided = known != UNKNOWN and known == after
+            if cut or not decided:
+                o = details + DETAIL_SIZE * surfel
+                owner = int(tab[o + SURFEL_OWNER])
+            if decided:
+                surfel = -1
+            else:
+                if known != UNKNOWN:
+                    a = t + (abs(l0) - 1.0) / abs(slope)
+                if after != UNKNOWN:
+                    b = end - (abs(l1) - 1.0) / abs(slope)
+                guess = t - l0 / slope if slope != 0.0 else t
+                slope *= np.float64(tab[o + THICK])
+                stray, bend = speed * np.float64(tab[o + TURN]), speed * speed * np.float64(tab[o + BEND])
+            # Beyond a cut the run, or the state before it, is another owner's: exact states part the two.
+            foreign = cut and (kind == MONOTONE or kind == BENT) and work[RUN, RUN_OWNER] != owner
+            if foreign or (cut and kind == NONE and known == UNKNOWN and last >= 0 and last != owner):
+                asked = int(work[RUN, RUN_OWNER]) if foreign else owner
+                holds = _holds(blob, ints, asked, px + t * dx, py + t * dy, pz + t * dz)
+                if foreign:
+                    closing, at = (1 if holds else 0), t
+                    continue
+                state, count = change(state, holds, t, gap, out, count)
+        last = owner if cut else -1
+        if known != UNKNOWN:
+            if kind != NONE:
+                closing, at = known, t
+                if surfel >= 0:
+                    continue  # close the run first, then look at this voxel again
+            elif state != (known == 1):
+                state, count = change(state, known == 1, t, gap, out, count)
+        if surfel >= 0 or known == UNKNOWN:
+            kind = _enter(kind, work, a, max(a, b), owner, slope, stray, bend, guess)
+            if after != UNKNOWN:
+                closing, at = after, max(a, b)
+        t = max(end, t) + nudge
