@@ -15,6 +15,7 @@ from hhsr.kernels.layout import (
     FACET_COUNT,
     FACET_LEVELS,
     FRAME,
+    KINK,
     OWNER_INT_SIZE,
     OWNER_INTS,
     OWNER_PLANE_FLOATS,
@@ -77,7 +78,10 @@ def _settle(blob, ints, tab, code, search, local, corners, spare, rects):
             np.float64(tab[o + SLOPE_A]), np.float64(tab[o + SLOPE_B]), np.float64(tab[o + ERROR]), corners, spare,
         )  # fmt: skip
         if low <= local[BEST] - search[TOLERANCE]:
-            refine_cell(blob, ints, leaf, planes, count, local, face, a, b, half, corners, spare, rects)
+            refine_cell(
+                blob, ints, leaf, planes, count, local, face, a, b, half, np.float64(tab[o + KINK]),
+                np.float64(tab[o + THIRD]), corners, spare, rects,
+            )  # fmt: skip
     if local[BEST] < search[BEST]:
         x, y, z = turn_out_of_leaf(blob, frame, local[FOOT], local[FOOT + 1], local[FOOT + 2])
         offer(search, local[BEST], local[BEST_T], x + blob[frame], y + blob[frame + 1], z + blob[frame + 2])
@@ -129,7 +133,7 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
     local[VECTOR], local[VECTOR + 1], local[VECTOR + 2] = 0.0, 0.0, 0.0
     if moving:
         _seed_segment(blob, ints, search, local)
-    elif search[BEST] == FAR:
+    else:
         seed_point(blob, ints, search)
     local[LENGTH2], local[TOLERANCE] = search[LENGTH2], search[TOLERANCE]
     x, y, z = search[START], search[START + 1], search[START + 2]

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from hhsr.kernels.cell import cell_model, chart_of, direction_of, inverse_radius
-from hhsr.kernels.jet import has_jets, inverse_radius_jet
+from hhsr.kernels.jet import inverse_radius_bend
 from hhsr.kernels.layout import BOX
 from hhsr.kernels.maps import (
     cell_corners,
@@ -163,35 +163,32 @@ def cell_bound(blob, ints, leaf, planes, count, search, face, a, b, half, value,
 
 
 @unmanaged
-def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, corners, spare, rects):
+def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, kink, third, corners, spare, rects):
     """Part a cell until what is left of it can hold no nearer point. rects: (NODE_ROOM, 6) scratch.
 
-    Parts are bounded from their exact jet and the bend of what they are a part of, which is proven anew at every
-    halving; by proven models alone where there are no jets.
+    Parts are bounded from their exact jet of second order and the cell's (kink, third); by proven models alone where
+    these are infinite.
     """
-    jets = has_jets(ints, leaf)
+    jets = third < math.inf
     rects[0, 0], rects[0, 1], rects[0, 2], rects[0, 3] = a, b, half, -1.0
-    rects[0, 4], rects[0, 5] = -math.inf, math.inf
     depth = 1
     while depth > 0:
         depth -= 1
         a, b, half, low = rects[depth, 0], rects[depth, 1], rects[depth, 2], rects[depth, 3]
-        bend_lo, bend_hi = rects[depth, 4], rects[depth, 5]
         if low > search[BEST] - search[TOLERANCE]:
             continue
-        if jets:
-            _, _, _, _, _, _, _, _, lo, hi, _, _ = cell_model(blob, ints, leaf, face, a, b, half, half)
-            bend_lo, bend_hi = max(bend_lo, lo), min(bend_hi, hi)
         half *= 0.5
         base = depth
         for corner in range(4):
             ca, cb = a + (half if corner & 1 else -half), b + (half if corner & 2 else -half)
             w = 0.0
-            if jets and bend_hi < math.inf:
-                w, ga, gb = inverse_radius_jet(blob, ints, leaf, face, ca, cb)
+            if jets:
+                w, ga, gb, waa, wab, wbb = inverse_radius_bend(blob, ints, leaf, face, ca, cb)
                 if w > 0.0:
                     # Over the part W − tangent lies in half² [min(bend_lo, 0), max(bend_hi, 0)].
-                    up, down = half * half * max(bend_hi, 0.0), half * half * min(bend_lo, 0.0)
+                    middle, wide = 0.5 * (waa + wbb), math.sqrt(0.25 * (waa - wbb) ** 2 + wab * wab)
+                    wide += 2.0 * kink + third * half * math.sqrt(2.0)
+                    up, down = half * half * max(middle + wide, 0.0), half * half * min(middle - wide, 0.0)
                     value, error = w + 0.5 * (up + down), 0.5 * (up - down) + 1e-12 * w
             if w == 0.0:
                 value, ga, gb, error, _, _, _, _, _, _, _, _ = cell_model(blob, ints, leaf, face, ca, cb, half, half)
@@ -209,9 +206,8 @@ def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, corne
             # Insert so that the nearest is parted first.
             k = depth
             while k > base and rects[k - 1, 3] < low:
-                for q in range(6):
+                for q in range(4):
                     rects[k, q] = rects[k - 1, q]
                 k -= 1
             rects[k, 0], rects[k, 1], rects[k, 2], rects[k, 3] = ca, cb, half, low
-            rects[k, 4], rects[k, 5] = bend_lo, bend_hi
             depth += 1
