@@ -72,7 +72,7 @@ def segments_of(shape: hhsr.Shape, count: int, rng: np.random.Generator) -> tupl
     return through - far * way, through + far * way
 
 
-def steps_against(shape: hhsr.Shape, starts: np.ndarray, ends: np.ndarray, room: int = 20_000_000) -> int:
+def steps_against(shape: hhsr.Shape, starts: np.ndarray, ends: np.ndarray, room: int = 2_000_000) -> int:
     """Return on how many segments (n, 3) → (n, 3) the states at small steps and the crossings disagree.
 
     On longer than the resolution; or, where both have as many crossings, on more than a step and the tolerance.

@@ -165,7 +165,8 @@ def vtk_queries(vertices: np.ndarray, faces: np.ndarray, given: Cases, threads: 
 def _look_up(values: np.ndarray, low: np.ndarray, inverse: float, points: np.ndarray, out: np.ndarray) -> None:
     """Fill (n,) trilinear values of a grid at points (n, 3)."""
     for n in range(points.shape[0]):
-        u, v, w = ((points[n, k] - low[k]) * inverse for k in range(3))
+        u, v = (points[n, 0] - low[0]) * inverse, (points[n, 1] - low[1]) * inverse
+        w = (points[n, 2] - low[2]) * inverse
         i = min(max(int(u), 0), values.shape[0] - 2)
         j = min(max(int(v), 0), values.shape[1] - 2)
         k = min(max(int(w), 0), values.shape[2] - 2)

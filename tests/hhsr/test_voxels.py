@@ -101,7 +101,7 @@ def test_a_plane_holds_all_over_its_voxel(depth: int, seed: int) -> None:
                 slopes.append(excess_along(grid.blob, grid.ints, leaf, *p, *d)[1])
             assert abs(slopes[0] - thick * float(plane[:3].astype(float) @ way)) <= details[TURN]
             assert abs(slopes[1] - slopes[0]) <= details[BEND] * 1e-2 + 1e-9
-    assert bent > 0 or seed == 1
+    assert bent > 0 or depth == 0  # a single leaf may have exponents, which bound no bend
 
 
 def border_points(shape: Shape, rng: np.random.Generator, count: int) -> np.ndarray:
