@@ -193,7 +193,7 @@ class Proofs(Records):
 
     def fill_voxels(self, blob: FloatArray) -> FloatArray:
         """Return the finished blob with the grid of voxels behind it."""
-        low, high = self.bounds(blob, np.eye(3), np.zeros(3))
+        low, high = self.bounds(read_only(blob), np.eye(3), np.zeros(3))
         extent = high - low
         if not np.isfinite(extent).all() or not (extent > 0).all():
             return blob

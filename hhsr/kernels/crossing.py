@@ -40,7 +40,7 @@ def follow_segment(
     dx, dy, dz = ex - px, ey - py, ez - pz
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
     if length == 0.0:
-        return solid_contains(blob, ints, tab, root, px, py, pz), 0
+        return solid_contains(blob, ints, tab, root, px, py, pz), np.int64(0)
     gap = MERGE / length
     if root == 0 and ints[VOXELS] != 0:
         return follow_voxels(
@@ -65,8 +65,8 @@ def follow_segment(
         )
     begin = solid_contains(blob, ints, tab, root, px, py, pz)
     state, count, done = follow_tree(
-        blob, ints, tab, root, px, py, pz, dx, dy, dz, 0.0, 1.0, gap, resolution, tolerance, first, begin, out, 0,
-        work, slots, pending,
+        blob, ints, tab, root, px, py, pz, dx, dy, dz, 0.0, 1.0, gap, resolution, tolerance, first, begin, out,
+        np.int64(0), work, slots, pending,
     )  # fmt: skip
     if not done and count <= out.shape[0]:
         _, count = emit(state, solid_contains(blob, ints, tab, root, ex, ey, ez), 1.0, out, count)
@@ -90,7 +90,23 @@ def cross_many(blob, starts, ends, resolution, tolerance, counts, begins, ts):
         px, py, pz = into_tree(blob, ints, starts[i, 0], starts[i, 1], starts[i, 2])
         ex, ey, ez = into_tree(blob, ints, ends[i, 0], ends[i, 1], ends[i, 2])
         begins[i], count = follow_segment(
-            blob, ints, tab, 0, px, py, pz, ex, ey, ez, resolution, tolerance, False, ts[used:], work, slots, pending
+            blob,
+            ints,
+            tab,
+            np.int64(0),
+            px,
+            py,
+            pz,
+            ex,
+            ey,
+            ez,
+            resolution,
+            tolerance,
+            np.bool_(False),
+            ts[used:],
+            work,
+            slots,
+            pending,
         )
         if count > ts.shape[0] - used:
             return i, used
@@ -124,7 +140,23 @@ def cross_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance, offsets, t, p
     px, py, pz = into_tree(blob, ints, ax, ay, az)
     ex, ey, ez = into_tree(blob, ints, bx, by, bz)
     inside, count = follow_segment(
-        blob, ints, tab, 0, px, py, pz, ex, ey, ez, resolution, tolerance, False, t, work, slots, pending
+        blob,
+        ints,
+        tab,
+        np.int64(0),
+        px,
+        py,
+        pz,
+        ex,
+        ey,
+        ez,
+        resolution,
+        tolerance,
+        np.bool_(False),
+        t,
+        work,
+        slots,
+        pending,
     )
     if count > t.shape[0]:
         return -1
@@ -149,7 +181,23 @@ def first_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance):
     px, py, pz = into_tree(blob, ints, ax, ay, az)
     ex, ey, ez = into_tree(blob, ints, bx, by, bz)
     _, count = follow_segment(
-        blob, ints, tab, 0, px, py, pz, ex, ey, ez, resolution, tolerance, True, t, work, slots, pending
+        blob,
+        ints,
+        tab,
+        np.int64(0),
+        px,
+        py,
+        pz,
+        ex,
+        ey,
+        ez,
+        resolution,
+        tolerance,
+        np.bool_(True),
+        t,
+        work,
+        slots,
+        pending,
     )
     return t[0] if count > 0 else np.nan
 
@@ -167,7 +215,7 @@ def first_exits(blob, root, centre, rays, resolution, tolerance, out):
     for i in range(rays.shape[0]):
         inside, count = follow_segment(
             blob, ints, tab, root, x, y, z, x + rays[i, 0], y + rays[i, 1], z + rays[i, 2],
-            resolution, tolerance, True, t, work, slots, pending,
+            resolution, tolerance, np.bool_(True), t, work, slots, pending,
         )  # fmt: skip
         out[i] = (t[0] if count > 0 else 1.0) if inside else 0.0
 
@@ -187,7 +235,23 @@ def first_many(blob, starts, ends, resolution, tolerance, out):
         px, py, pz = into_tree(blob, ints, starts[i, 0], starts[i, 1], starts[i, 2])
         ex, ey, ez = into_tree(blob, ints, ends[i, 0], ends[i, 1], ends[i, 2])
         _, count = follow_segment(
-            blob, ints, tab, 0, px, py, pz, ex, ey, ez, resolution, tolerance, True, t, work, slots, pending
+            blob,
+            ints,
+            tab,
+            np.int64(0),
+            px,
+            py,
+            pz,
+            ex,
+            ey,
+            ez,
+            resolution,
+            tolerance,
+            np.bool_(True),
+            t,
+            work,
+            slots,
+            pending,
         )
         out[i] = t[0] if count > 0 else np.nan
     return bad

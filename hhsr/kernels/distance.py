@@ -112,9 +112,9 @@ def _nearest_step(blob, ints, tab, search):
             h = nx * px + ny * py + nz * pz - blob[o + 3]
             if abs(h) < search[BEST]:
                 x, y, z = px - h * nx, py - h * ny, pz - h * nz
-                if solid_contains(blob, ints, tab, 0, x + SIDE * nx, y + SIDE * ny, z + SIDE * nz) != solid_contains(
-                    blob, ints, tab, 0, x - SIDE * nx, y - SIDE * ny, z - SIDE * nz
-                ):
+                if solid_contains(
+                    blob, ints, tab, np.int64(0), x + SIDE * nx, y + SIDE * ny, z + SIDE * nz
+                ) != solid_contains(blob, ints, tab, np.int64(0), x - SIDE * nx, y - SIDE * ny, z - SIDE * nz):
                     offer(search, abs(h), float(end), x, y, z)
     for k in range(ints[EDGE_COUNT]):
         o = ints[EDGE_FLOATS] + 6 * k
@@ -192,7 +192,7 @@ def nearest_many(blob, points, tolerance, distance, foot):
         x, y, z = into_tree(blob, ints, points[i, 0], points[i, 1], points[i, 2])
         set_search(search, x, y, z, 0.0, 0.0, 0.0, tolerance)
         search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
-        distance[i] = -search[BEST] if solid_contains(blob, ints, tab, 0, x, y, z) else search[BEST]
+        distance[i] = -search[BEST] if solid_contains(blob, ints, tab, np.int64(0), x, y, z) else search[BEST]
         foot[i, 0], foot[i, 1], foot[i, 2] = out_of_tree(blob, ints, search[FOOT], search[FOOT + 1], search[FOOT + 2])
     return bad
 
@@ -324,24 +324,9 @@ def clearance_many(blob, starts, ends, tolerance, value, t, foot):
         ex, ey, ez = into_tree(blob, ints, ends[i, 0], ends[i, 1], ends[i, 2])
         dx, dy, dz = ex - px, ey - py, ez - pz
         inside, count = follow_segment(
-            blob,
-            ints,
-            tab,
-            0,
-            px,
-            py,
-            pz,
-            ex,
-            ey,
-            ez,
-            0.1 * tolerance,
-            0.1 * tolerance,
-            False,
-            ts,
-            work,
-            slots,
-            pending,
-        )
+            blob, ints, tab, np.int64(0), px, py, pz, ex, ey, ez, 0.1 * tolerance, 0.1 * tolerance, np.bool_(False),
+            ts, work, slots, pending,
+        )  # fmt: skip
         if not inside and count == 0:
             set_search(search, px, py, pz, dx, dy, dz, tolerance)
             search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)

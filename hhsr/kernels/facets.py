@@ -100,7 +100,7 @@ def list_facets(blob, owner, leaf, planes, count, codes, discs):
             whole = True
             slant = ray_thickness(face, a, b, half, half, value, ga, gb, error)
             cell_corners(face, a, b, half, value, ga, gb, corners)
-            size = 4
+            size = np.int64(4)
             for k in range(count):
                 q = planes + 4 * k
                 for i in range(size):

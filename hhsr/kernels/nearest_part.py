@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 from numba import njit
 
 from hhsr.kernels.part import TRIANGLES, part_arrays
@@ -40,7 +41,7 @@ def triangle_bound(corner, blob, planes, count, search, corners, spare):
     for i in range(3):
         for k in range(3):
             corners[i, k] = corner[i, k]
-    size = 3
+    size = np.int64(3)
     for k in range(count):
         o = planes + 4 * k
         size = clip_polygon(corners, size, spare, blob[o], blob[o + 1], blob[o + 2], blob[o + 3])

@@ -131,7 +131,7 @@ def strip_bound(blob, ints, slab, lobe, segment, planes, count, search, angle, t
     vx, vy, vz = corners[3, 0] - corners[0, 0], corners[3, 1] - corners[0, 1], corners[3, 2] - corners[0, 2]
     nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
-    size = 4
+    size = np.int64(4)
     for k in range(count):
         q = planes + 4 * k
         size = clip_polygon(corners, size, spare, blob[q], blob[q + 1], blob[q + 2], blob[q + 3] + thick)
@@ -206,7 +206,7 @@ def nearest_on_slab(blob, ints, slab, planes, count, search, corners, spare, rec
     for k in range(ints[slab + LOBE_COUNT]):
         lobe = ints[slab + LOBES] + LOBE_INT_SIZE * k
         spheres = ints[lobe + LOBE_SPHERES]
-        best, at = 1e300, 0
+        best, at = 1e300, np.int64(0)
         for segment in range(TABLE):
             o = spheres + 6 * segment
             distance, _ = distance_to(search, blob[o], blob[o + 1], blob[o + 2])

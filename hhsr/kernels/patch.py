@@ -130,7 +130,7 @@ def cell_bound(blob, ints, leaf, planes, count, search, face, a, b, half, value,
         )
     slant = ray_thickness(face, a, b, half, half, value, ga, gb, error)
     cell_corners(face, a, b, half, value, ga, gb, corners)
-    size = 4
+    size = np.int64(4)
     for k in range(count):
         o = planes + 4 * k
         size = clip_polygon(corners, size, spare, blob[o], blob[o + 1], blob[o + 2], blob[o + 3] + slant)

@@ -60,8 +60,8 @@ def _close_run(
         return state, count
     if kind == CLIPPED:
         state, count, _ = follow_tree(
-            blob, ints, tab, 0, px, py, pz, dx, dy, dz, begin, end, gap, resolution, tolerance, False, state, out,
-            count, work, slots, pending,
+            blob, ints, tab, np.int64(0), px, py, pz, dx, dy, dz, begin, end, gap, resolution, tolerance,
+            np.bool_(False), state, out, count, work, slots, pending,
         )  # fmt: skip
         state, count = change(state, new, end, gap, out, count)
         return state, merge_touches(out, count, gap)
@@ -143,7 +143,7 @@ def follow_voxels(
     start, stop = _clip(uy, vy, float(top_y), start, stop)
     start, stop = _clip(uz, vz, float(top_z), start, stop)
     if not start < stop:
-        return False, 0
+        return False, np.int64(0)
     # Along an axis the border at x is met at x·i + k; a still axis never is.
     ix = 1.0 / vx if abs(vx) >= STILL else 0.0
     iy = 1.0 / vy if abs(vy) >= STILL else 0.0
@@ -158,21 +158,21 @@ def follow_voxels(
     nudge = max(NUDGE * min(1.0, blob[f + 3]) / length, 1e-15)
     speed = math.sqrt(vx * vx + vy * vy + vz * vz)
     t = start + nudge if start > 0.0 else 0.0
-    begin = start <= 0.0 and solid_contains(blob, ints, tab, 0, px, py, pz)
-    state, count = begin, 0
-    kind, closing, at, last = NONE, UNKNOWN, 0.0, -1
+    begin = start <= 0.0 and solid_contains(blob, ints, tab, np.int64(0), px, py, pz)
+    state, count = begin, np.int64(0)
+    kind, closing, at, last = np.int64(NONE), UNKNOWN, 0.0, -1
     while True:
         if closing != UNKNOWN:
             state, count = _close_run(
                 blob, ints, tab, kind, px, py, pz, dx, dy, dz, length, at, closing == 1, resolution, tolerance, gap,
                 state, out, count, work, slots, pending,
             )  # fmt: skip
-            kind, closing = NONE, UNKNOWN
+            kind, closing = np.int64(NONE), UNKNOWN
         if first and count > 0 and (t if kind == NONE else work[RUN, RUN_START]) > out[0] + gap:
             return begin, count
         if t >= stop:
             # The end has its own state: along a cutting plane it may not be the one that the walk came with.
-            holds = stop >= 1.0 and solid_contains(blob, ints, tab, 0, qx, qy, qz)
+            holds = stop >= 1.0 and solid_contains(blob, ints, tab, np.int64(0), qx, qy, qz)
             if kind == NONE:
                 state, count = change(state, holds, stop, gap, out, count)
                 return begin, count
