@@ -20,6 +20,8 @@ class FitOptions:
     ----------
     max_parameters : most numbers that may be stored (`Shape.parameters` ≤ this), ≥ 16; None: what the error asks for.
     max_mean_error_mm, max_error_mm : stop spending when the two-sided mean / sampled maximum is below; None: no goal.
+    max_error_weight : what the largest miss counts beside the mean, 0 … 1, where the default recipe chooses: 0.1 lowers
+        maxima and costs some of the mean.
     retain : keep the whole mesh as one retained part (a vessel tree); the budget is then not asked.
     recipe : "default", or "paper": mutex cuts by Eq. 9, superquadrics with spline exponents, uniform centres, bands.
     seed : of every random choice.
@@ -40,6 +42,7 @@ class FitOptions:
     max_parameters: int | None = None
     max_mean_error_mm: float | None = None
     max_error_mm: float | None = None
+    max_error_weight: float = 0.01
     retain: bool = False
     recipe: Literal["default", "paper"] = "default"
     seed: int = 0
@@ -62,6 +65,7 @@ class FitOptions:
         _whole("samples", self.samples, 1000, 10_000_000)
         for name in ("max_mean_error_mm", "max_error_mm", "t_mm", "t3_mm"):
             _number(name, getattr(self, name), math.nextafter(0.0, 1.0), math.inf)
+        _number("max_error_weight", self.max_error_weight, 0.0, 1.0)
         _number("t1", self.t1, 0.0, 1.0)
         _number("t2_mm3", self.t2_mm3, 0.0, math.inf)
         _number("half_width_mm", self.half_width_mm, 0.0, math.inf)
