@@ -25,7 +25,7 @@ def closed(solid: Solid, task: Task, section: Section, leaf: ModelLeaf, aim: Aim
     """
     bounded = with_section(task, section)
     margin = bounded.bound - (1.0 - MARGIN) * bounded.slack
-    view, covering = view_of(bounded.directions, leaf.scale_field), view_of(section.along, leaf.scale_field)
+    view, covering = view_of(bounded.directions, leaf), view_of(section.along, leaf)
     own = view._replace(starts=view.starts[: len(task.directions) + 1])
     behind = view._replace(starts=view.starts[len(bounded.along) + len(bounded.free) :])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import numba
@@ -11,6 +12,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hhsr.fitting.aim import Aim
+from hhsr.fitting.base import base_radii, local
+from hhsr.fitting.bases import base_that_pays
 from hhsr.fitting.closing import closed
 from hhsr.fitting.lookahead import Piece
 from hhsr.fitting.refine import Figures, Misses, figures, improved, mending_rows, view_of
@@ -29,7 +32,7 @@ from hhsr.fitting.section import Section, section_of
 from hhsr.fitting.solid import Solid
 from hhsr.fitting.spend import counts_within
 from hhsr.fitting.task import Task, first_rows, hint_rows, start_rows, task_of
-from hhsr.model import FloatArray, IntArray, ModelLeaf, ScaleField, frozen
+from hhsr.model import FloatArray, IntArray, ModelLeaf, ScaleField
 
 T = TypeVar("T")
 
@@ -40,17 +43,18 @@ FINEST = (60, 8_000)
 class Effort(NamedTuple):
     """Centres of the finest grid for each number to spend, Gauss-Newton steps in a row, rounds of swaps at most.
 
-    stride: of how many samples and rays one is looked at.
+    stride: of how many samples and rays one is looked at. bases: whether richer ones may be bought, if at all.
     """
 
     atoms: int
     steps: int
     swaps: int
     stride: int
+    bases: bool
 
 
-SCOUT = Effort(5, 2, 1, 2)
-THOROUGH = Effort(7, 3, 3, 1)
+SCOUT = Effort(5, 2, 1, 2, bases=False)
+THOROUGH = Effort(7, 3, 3, 1, bases=True)
 SWAPPED = 0.3
 FURTHER = 1.3
 SEED = 5
@@ -82,19 +86,19 @@ class Fitted(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """A piece, what its leaf has to tell, where it is cut off, and its ellipsoid's (6,) half axes in mm."""
+    """A piece, what its leaf has to tell, where it is cut off, and the leaf without a field: an ellipsoid."""
 
     piece: Piece
     task: Task
     section: Section
-    half_axes: FloatArray
+    bare: ModelLeaf
 
 
 class Workshop:
     """What the leaves of a solid's pieces start from, kept: many partings share pieces."""
 
-    def __init__(self, solid: Solid, aim: Aim) -> None:
-        self.solid, self.aim = solid, aim
+    def __init__(self, solid: Solid, aim: Aim, bases: tuple[tuple[bool, int], ...] = ()) -> None:
+        self.solid, self.aim, self.bases = solid, aim, bases
         self._kept: dict[tuple[int, int], Prepared] = {}
 
     def prepared(self, pieces: Sequence[Piece], stride: int) -> list[Prepared]:
@@ -107,7 +111,8 @@ class Workshop:
     def _look(self, piece: Piece, stride: int) -> Prepared:
         task = task_of(self.solid, piece.region, piece.members, piece.centre, SEED, stride)
         half_axes = fit_ellipsoid(start_rows(task, self.solid).joined(hint_rows(task, self.solid)))
-        return Prepared(piece, task, section_of(self.solid, piece.region, piece.centre), half_axes)
+        bare = leaf_of(piece.centre, half_axes, ScaleField.none())
+        return Prepared(piece, task, section_of(self.solid, piece.region, piece.centre), bare)
 
 
 def fit_leaves(workshop: Workshop, pieces: Sequence[Piece], budget: int, effort: Effort) -> Fitted:
@@ -122,11 +127,16 @@ def fit_leaves(workshop: Workshop, pieces: Sequence[Piece], budget: int, effort:
     ready = workshop.prepared(pieces, effort.stride)
     tasks = [r.task for r in ready]
     grid = grid_for(int(np.clip(effort.atoms * budget / len(pieces), *FINEST)))
-    none = ScaleField(grid, NONE, frozen([]))
-    bare = [leaf_of(r.piece.centre, r.half_axes, none) for r in ready]
+    bare = [r.bare for r in ready]
     atoms = in_threads(lambda k: atoms_of(grid, ready[k].task.directions), len(ready))
-    rows = [first_rows(r.task, solid, r.half_axes) for r in ready]
+    rows = [first_rows(r.task, solid, r.bare) for r in ready]
     leaves = _chosen(atoms, bare, rows, [NONE] * len(pieces), [free // len(pieces) + 1] * len(pieces), free)
+    if workshop.bases and effort.bases:
+        bare = in_threads(lambda k: base_that_pays(solid, ready[k].task, leaves[k], workshop.bases), len(leaves))
+        free -= sum(leaf.parameters for leaf in bare) - LEAF_NUMBERS * len(bare)
+        atoms = in_threads(lambda k: atoms_of(grid, local(bare[k], ready[k].task.directions)), len(bare))
+        rows = [first_rows(r.task, solid, leaf) for r, leaf in zip(ready, bare, strict=True)]
+        leaves = _chosen(atoms, bare, rows, [NONE] * len(bare), [leaf.scale_field.index.size for leaf in leaves], free)
     best, found = _refined(workshop, ready, leaves, effort.steps)
     for _ in range(effort.swaps):
         tried = _swapped(atoms, tasks, best.leaves, found, free)
@@ -170,7 +180,7 @@ def _chosen(
     atoms: of the rows' directions. likely: how many each leaf chooses at first; those whose last one still pays go on.
     """
     selections = in_threads(
-        lambda k: Selection(atoms[k], rows[k], np.asarray(leaves[k].superquadric.half_axes), held[k]), len(leaves)
+        lambda k: Selection(atoms[k], rows[k], base_radii(leaves[k], rows[k].directions), held[k]), len(leaves)
     )
     wanted = [min(count, free) for count in likely]
     while True:
@@ -181,10 +191,7 @@ def _chosen(
             break
         for k in short:
             wanted[k] = min(int(FURTHER * wanted[k]) + 8, free)
-    return [
-        leaf_of(leaf.centre, leaf.superquadric.half_axes, s.field(k))
-        for leaf, s, k in zip(leaves, selections, counts, strict=True)
-    ]
+    return [replace(leaf, scale_field=s.field(k)) for leaf, s, k in zip(leaves, selections, counts, strict=True)]
 
 
 def _refined(
@@ -195,7 +202,7 @@ def _refined(
     solid, aim = workshop.solid, workshop.aim
 
     def work(k: int) -> tuple[ModelLeaf, Misses]:
-        view = view_of(ready[k].task.directions, leaves[k].scale_field)
+        view = view_of(ready[k].task.directions, leaves[k])
         return improved(solid, ready[k].task, leaves[k], view, steps, aim.power)
 
     done = in_threads(work, len(leaves))

@@ -8,6 +8,7 @@ import numpy as np
 
 from hhsr.errors import FitError
 from hhsr.fitting.aim import aim_of
+from hhsr.fitting.base import ANY, TURNED
 from hhsr.fitting.goals import enough
 from hhsr.fitting.keep import affordable
 from hhsr.fitting.leaves import LEAF_NUMBERS, SCOUT, THOROUGH, Effort, Fitted, Workshop, fit_leaves
@@ -19,6 +20,7 @@ from hhsr.fitting.quantise import quantised
 from hhsr.fitting.solid import solid_of
 from hhsr.model import FloatArray, IntArray, Node, RetainedPart
 
+KINDS = {"ellipsoid": (), "turned": TURNED, "any": ANY}
 POSE_NUMBERS = 6
 CUT_NUMBERS = 3
 USUAL_NUMBERS = 1000
@@ -29,7 +31,7 @@ MOST_PIECES = 32
 PATIENCE = 4
 EACH_UP_TO = 6
 HIDDEN = 0.03
-SPIKE = 10.0
+SPIKE = 12.0
 MENDED = 2
 PRUNED = 2
 FINALISTS = 2
@@ -73,7 +75,7 @@ def fit_default(vertices: FloatArray, faces: IntArray, options: FitOptions) -> N
     def fitted(budget: int) -> Node:
         samples = int(np.clip(SAMPLES_A_NUMBER * budget, *SAMPLES))
         solid = solid_of(unit, faces, samples, options.seed)
-        return quantised(scaled(_spent(Workshop(solid, aim), budget, size), size))
+        return quantised(scaled(_spent(Workshop(solid, aim, KINDS[options.bases]), budget, size), size))
 
     if options.max_mean_error_mm is None and options.max_error_mm is None:
         return fitted(options.max_parameters if options.max_parameters is not None else USUAL_NUMBERS)

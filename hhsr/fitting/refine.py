@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from hhsr.fitting.base import base_radii, base_slopes, local
 from hhsr.fitting.rows import GRAZING, Rows
-from hhsr.fitting.scale_field import leaf_of, ridge_of
+from hhsr.fitting.scale_field import ridge_of
 from hhsr.fitting.section import Section
 from hhsr.fitting.solid import Solid
 from hhsr.fitting.task import BOUND_RAYS, HOLD, RAYS, Task, ray_share
 from hhsr.kernels.refinement import (
-    axis_slopes,
     chosen_rows,
-    ellipsoid_radii,
     field_values,
     normal_equations,
     own_misses,
 )
 from hhsr.kernels.selection import solve_normal
-from hhsr.model import MAX_SCALE, FloatArray, IntArray, ModelLeaf, ScaleField
+from hhsr.model import MAX_SCALE, FloatArray, IntArray, ModelLeaf, ScaleField, Superquadric
 
 AXES_DAMPING = 1e-3
 LONGEST_STEP = 0.2
+FARTHEST_LOGIT = 6.0
 SHARES = (1.0, 0.5, 0.25)
 
 
@@ -70,12 +71,12 @@ class Figures(NamedTuple):
     spot: FloatArray
 
 
-def view_of(directions: FloatArray, field: ScaleField) -> View:
-    """Return a field's centres as seen in (n, 3) unit directions."""
-    grid, index = field.grid, field.index
+def view_of(directions: FloatArray, leaf: ModelLeaf) -> View:
+    """Return a leaf's centres as seen in (n, 3) unit directions of the tree's frame."""
+    grid, index = leaf.scale_field.grid, leaf.scale_field.index
     centres = np.ascontiguousarray(grid.centres[index]) if index.size else np.zeros((0, 3))
     extents = grid.extents[index] if index.size else np.zeros(0)
-    return View(*chosen_rows(np.ascontiguousarray(directions), centres, extents))
+    return View(*chosen_rows(np.ascontiguousarray(local(leaf, directions)), centres, extents))
 
 
 def improved(
@@ -133,8 +134,8 @@ def figures(
 
 def radii_of(leaf: ModelLeaf, directions: FloatArray, view: View | None = None) -> FloatArray:
     """Return (n,) radii, mm, of a leaf on the tree's axes. view: of these directions, where there is one."""
-    seen = view_of(directions, leaf.scale_field) if view is None else view
-    radii: FloatArray = (1.0 - seen.scales(leaf)) * ellipsoid_radii(np.asarray(leaf.superquadric.half_axes), directions)
+    seen = view_of(directions, leaf) if view is None else view
+    radii: FloatArray = (1.0 - seen.scales(leaf)) * base_radii(leaf, directions)
     return radii
 
 
@@ -144,7 +145,7 @@ def misses(task: Task, solid: Solid, leaf: ModelLeaf, view: View, own: Misses | 
     And behind cuts: where it falls short of its bounds, and (weak) how far it strays from its base.
     own: the leaf's misses for a task that differs in its bounds only: what they say of samples and own points stays.
     """
-    base = ellipsoid_radii(np.asarray(leaf.superquadric.half_axes), task.directions)
+    base = base_radii(leaf, task.directions)
     radius = (1.0 - view.scales(leaf)) * base
     miss, slope, share = np.zeros(radius.size), np.ones(radius.size), np.zeros(radius.size)
     first, second = task.along.shape[0], task.along.shape[0] + task.free.shape[0]
@@ -203,14 +204,14 @@ def _own_misses(
 
 
 def _change(task: Task, found: Misses, weight: FloatArray, leaf: ModelLeaf, view: View) -> FloatArray:
-    """Return a Gauss-Newton step of the weights and the half axes' logarithms: ridge on those, damping on these."""
-    field, axes = leaf.scale_field, np.asarray(leaf.superquadric.half_axes)
+    """Return a Gauss-Newton step of weights (with a ridge), half axes' logarithms and logits (with a damping)."""
+    field = leaf.scale_field
     s = view.scales(leaf)
-    q = ellipsoid_radii(axes, task.directions)
-    by_half = (found.slope * (1.0 - s))[:, None] * axis_slopes(axes, task.directions, q)
+    q = base_radii(leaf, task.directions)
+    by_base = (found.slope * (1.0 - s))[:, None] * base_slopes(leaf, task.directions, q)
     slope = np.where(s < MAX_SCALE, -found.slope * q, 0.0)
     count = field.weights.size
-    matrix, right = normal_equations(*view, slope, by_half, found.miss, weight, count)
+    matrix, right = normal_equations(*view, slope, by_base, found.miss, weight, count)
     diagonal = np.diag(matrix)
     mean = float(diagonal[:count].mean()) if count else 0.0
     floor = ridge_of(field.grid.extents[field.index]) * mean if count else np.zeros(0)
@@ -221,9 +222,13 @@ def _change(task: Task, found: Misses, weight: FloatArray, leaf: ModelLeaf, view
 
 
 def _changed(leaf: ModelLeaf, change: FloatArray) -> ModelLeaf:
-    """Return the leaf with its weights and the logarithms of its half axes changed."""
-    field, count = leaf.scale_field, leaf.scale_field.weights.size
-    stretch = np.exp(np.clip(change[count:], -LONGEST_STEP, LONGEST_STEP))
-    weights = field.weights + change[:count]
-    half_axes = np.asarray(leaf.superquadric.half_axes) * stretch
-    return leaf_of(leaf.centre, half_axes, ScaleField(field.grid, field.index, weights))
+    """Return the leaf with its weights, the logarithms of its half axes and its logits changed."""
+    field, base, count = leaf.scale_field, leaf.superquadric, leaf.scale_field.weights.size
+    moved = np.clip(change[count:], -LONGEST_STEP, LONGEST_STEP)
+    logits = np.concatenate([base.azimuth_logits, base.elevation_logits]) + moved[6:]
+    azimuth, elevation = np.split(np.clip(logits, -FARTHEST_LOGIT, FARTHEST_LOGIT), [base.azimuth_logits.size])
+    return replace(
+        leaf,
+        superquadric=Superquadric(np.asarray(base.half_axes) * np.exp(moved[:6]), azimuth, elevation),
+        scale_field=ScaleField(field.grid, field.index, field.weights + change[:count]),
+    )

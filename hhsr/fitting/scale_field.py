@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hhsr.fitting.base import base_radii, local
 from hhsr.fitting.rows import Rows
 from hhsr.kernels.greedy import begin, extend, triangle_of
 from hhsr.kernels.refinement import chosen_rows, ellipsoid_radii, normal_equations
@@ -51,16 +52,17 @@ def atoms_of(grid: CentreGrid, directions: FloatArray) -> Atoms:
 class Selection:
     """Centres of one leaf in the order in which they pay, `held` of them kept from before; more are chosen when asked.
 
-    atoms: of the rows' directions. Bounds count where the bare ellipsoid breaks them.
+    atoms: of the rows' directions. base: (n,) mm, the bare superquadric's radii there; bounds count if it breaks them.
     """
 
-    def __init__(self, atoms: Atoms, rows: Rows, half_axes: FloatArray, held: IntArray = NONE) -> None:
+    def __init__(self, atoms: Atoms, rows: Rows, base: FloatArray, held: IntArray = NONE) -> None:
         self.grid = atoms.grid
         self.held = held.size
         self.done = 0
         self.complete = False
         self._held = held
-        scale, target = _scale_and_target(rows, half_axes)
+        scale, target = _scale_and_target(rows, base)
+        self._start = float((target**2).sum())
         diagonal, full, pull, usable = begin(*atoms[4:], scale, target, ridge_of(self.grid.extents))
         self._system: tuple[Any, ...] = (*atoms[1:], scale, diagonal, full, usable, full.copy(), pull)
         self._basis = np.zeros((0, self.grid.size), np.float32)
@@ -89,6 +91,11 @@ class Selection:
     def gains(self) -> FloatArray:
         """(k,) falls of the rows' sum of squares, mm²."""
         return self._gains[: self.done]
+
+    @property
+    def left(self) -> float:
+        """What the rows' sum of squares still is, mm²."""
+        return self._start - float(self.gains.sum())
 
     def field(self, count: int) -> ScaleField:
         """Return the scale field of the first `count` centres."""
@@ -166,7 +173,8 @@ def fit_ellipsoid(rows: Rows, iterations: int = 12) -> FloatArray:
 
 def select_centres(rows: Rows, half_axes: FloatArray, grid: CentreGrid, count: int, held: IntArray = NONE) -> Selection:
     """Return up to `count` centres that bring the leaf nearest to the rows, the `held` ones among them."""
-    selection = Selection(atoms_of(grid, rows.directions), rows, half_axes, held)
+    base = ellipsoid_radii(half_axes, rows.directions)
+    selection = Selection(atoms_of(grid, rows.directions), rows, base, held)
     selection.extend(count)
     return selection
 
@@ -175,8 +183,8 @@ def costs_of_dropping(rows: Rows, leaf: ModelLeaf) -> FloatArray:
     """Return (k,) by how much the rows' sum of squares (mm²) rises when a leaf loses one of its centres."""
     field = leaf.scale_field
     centres, extents = np.ascontiguousarray(field.grid.centres[field.index]), field.grid.extents[field.index]
-    scale, target = _scale_and_target(rows, np.asarray(leaf.superquadric.half_axes))
-    seen = chosen_rows(np.ascontiguousarray(rows.directions), centres, extents)
+    scale, target = _scale_and_target(rows, base_radii(leaf, rows.directions))
+    seen = chosen_rows(np.ascontiguousarray(local(leaf, rows.directions)), centres, extents)
     told = (scale > 0.0).astype(np.float64)
     nothing = np.zeros((scale.size, 0))
     pointer, index, value = seen
@@ -187,9 +195,8 @@ def costs_of_dropping(rows: Rows, leaf: ModelLeaf) -> FloatArray:
     return costs
 
 
-def _scale_and_target(rows: Rows, half_axes: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _scale_and_target(rows: Rows, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return (n,) scale and target of the linear system that rows ask of the scale field; scale 0: nothing."""
-    q = ellipsoid_radii(half_axes, rows.directions)
     weights = np.where(rows.bound & (q >= rows.radii), 0.0, rows.weights)
     return weights * q, weights * (q - rows.radii)
 

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hhsr.fitting.base import base_radii
 from hhsr.fitting.rows import GRAZING, BoolArray, Rows
 from hhsr.fitting.samples import side_by_side, turned_fibonacci
 from hhsr.fitting.solid import Region, Solid
-from hhsr.kernels.refinement import ellipsoid_radii
-from hhsr.model import FloatArray, IntArray
+from hhsr.model import FloatArray, IntArray, ModelLeaf
 
 RAYS = 2500
 BOUND_RAYS = 8000
@@ -145,14 +145,14 @@ def hint_rows(task: Task, solid: Solid) -> Rows:
     return Rows(task.behind, task.hint, weight, np.zeros(task.hint.size, dtype=bool))
 
 
-def first_rows(task: Task, solid: Solid, half_axes: FloatArray) -> Rows:
+def first_rows(task: Task, solid: Solid, leaf: ModelLeaf) -> Rows:
     """Return the rows that the first centres are chosen for, one for each of the task's directions.
 
     The samples in sight; and where the leaf is cut off the bounds that its base breaks. Elsewhere behind cuts, weakly,
     the base: without that the centres chosen for the surface beside a cut swing freely behind it, and open voids there
     (a liver: 0.34 mm with, 0.45 mm and more without).
     """
-    base = ellipsoid_radii(half_axes, task.behind)
+    base = base_radii(leaf, task.behind)
     weight = np.sqrt(ray_share(solid, BOUND_RAYS)) * task.bound
     weight *= np.sqrt(HOLD**2 + np.where(base < task.bound, task.urgency, 0.0) ** 2)
     free = np.zeros(task.free.shape[0])

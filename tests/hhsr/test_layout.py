@@ -127,7 +127,7 @@ def test_rows_for_the_first_centres_are_those_of_bounds_and_holds_together(solid
     region = piece.region.halves(np.array([1.0, 0.0, 0.0]), float(piece.centre[0]) + 0.05)[0]
     task = task_of(solid, region, np.flatnonzero(region.holds(solid.samples.points)), piece.centre, 1)
     axes = fit_ellipsoid(start_rows(task, solid))
-    rows = first_rows(task, solid, axes)
+    rows = first_rows(task, solid, leaf_of(piece.centre, axes, ScaleField.none()))
     assert np.array_equal(rows.directions, task.directions)
     told = rows.weights > 0.0
     assert told.sum() == task.along.shape[0] + task.behind.shape[0]
@@ -145,9 +145,10 @@ def test_a_step_that_does_not_help_is_halved_and_misses_never_grow(solid: Solid)
     assert parting.grown(2)
     piece = parting.pieces(2)[0]
     task = task_of(solid, piece.region, piece.members, piece.centre, 1)
-    rows = first_rows(task, solid, axes := fit_ellipsoid(start_rows(task, solid)))
+    axes = fit_ellipsoid(start_rows(task, solid))
+    rows = first_rows(task, solid, leaf_of(piece.centre, axes, ScaleField.none()))
     leaf = leaf_of(piece.centre, 1.3 * axes, select_centres(rows, axes, grid_for(300), 40).field(40))
-    view = view_of(task.directions, leaf.scale_field)
+    view = view_of(task.directions, leaf)
     costs = []
     for steps in range(4):
         found = improved(solid, task, leaf, view, steps, 1.5)[1]
