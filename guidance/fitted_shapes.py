@@ -20,7 +20,7 @@ from guidance.errors import SceneError
 if TYPE_CHECKING:
     from hhsr import Shape
 
-RECIPE = 2  # raise when the same options should be fitted anew
+RECIPE = 3  # raise when the same options should be fitted anew
 
 
 @dataclass(frozen=True)

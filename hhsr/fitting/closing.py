@@ -4,46 +4,48 @@ from __future__ import annotations
 
 import numpy as np
 
+from hhsr.fitting.aim import Aim
 from hhsr.fitting.refine import Misses, figures, improved, misses, radii_of, view_of
 from hhsr.fitting.section import Section
 from hhsr.fitting.solid import Solid
 from hhsr.fitting.task import MOST_URGENT, SLACK_OF_DEPTH, SLACK_OF_REACH, Task
 from hhsr.model import ModelLeaf
 
-WORST_SHARE = 0.01
 ROUNDS = 6
 STEPS = 3
 HARDER = 3.0
 MARGIN = 0.3
 
 
-def closed(solid: Solid, task: Task, section: Section, leaf: ModelLeaf, power: float) -> tuple[ModelLeaf, Misses]:
+def closed(solid: Solid, task: Task, section: Section, leaf: ModelLeaf, aim: Aim) -> tuple[ModelLeaf, Misses]:
     """Return a leaf, and its misses, after more Gauss-Newton steps in which the bounds that it breaks count ever more.
 
     A bound is broken where the radius is less than the plane's distance and 0.3 of the slack. Of all rounds the one
-    with the least score (mean miss and a hundredth of the largest) is kept: bounds that cannot be kept spoil the rest.
+    with the least score (mean miss and some of the largest) is kept: bounds that cannot be kept spoil the rest.
     """
     bounded = with_section(task, section)
     margin = bounded.bound - (1.0 - MARGIN) * bounded.slack
-    best, found = leaf, misses(task, solid, leaf, view_of(task, leaf.scale_field))
-    least = _score(solid, task, section, best, found)
+    view, covering = view_of(bounded.directions, leaf), view_of(section.along, leaf)
+    own = view._replace(starts=view.starts[: len(task.directions) + 1])
+    behind = view._replace(starts=view.starts[len(bounded.along) + len(bounded.free) :])
+
+    def score(leaf: ModelLeaf, found: Misses) -> float:
+        """By how much this leaf raises the mean miss, and its largest, mm."""
+        fit = figures(solid, task, section, leaf, found, covering)
+        return float(fit.total * task.stride / len(solid.samples.points) + aim.worst * fit.largest)
+
+    best, found = leaf, misses(task, solid, leaf, own)
+    least = score(best, found)
     for _ in range(ROUNDS):
-        broken = radii_of(leaf, bounded.behind) < margin
+        broken = radii_of(leaf, bounded.behind, behind) < margin
         if not broken.any():
             break
         bounded = bounded._replace(urgency=np.where(broken, HARDER * bounded.urgency, bounded.urgency))
-        leaf = improved(solid, bounded, leaf, STEPS, power)[0]
-        after = misses(task, solid, leaf, view_of(task, leaf.scale_field))
-        score = _score(solid, task, section, leaf, after)
-        if score < least:
-            best, found, least = leaf, after, score
+        leaf, after = improved(solid, bounded, leaf, view, STEPS, aim.power)
+        after = misses(task, solid, leaf, own, after)
+        if score(leaf, after) < least:
+            best, found, least = leaf, after, score(leaf, after)
     return best, found
-
-
-def _score(solid: Solid, task: Task, section: Section, leaf: ModelLeaf, found: Misses) -> float:
-    """Return what is to be as small as can be, mm: by how much this leaf raises the mean miss, and its largest."""
-    own = figures(solid, task, section, leaf, found)
-    return float(own.total * task.stride / len(solid.samples.points) + WORST_SHARE * own.largest)
 
 
 def with_section(task: Task, section: Section) -> Task:

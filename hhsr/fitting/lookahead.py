@@ -19,6 +19,7 @@ CENTRES = 12
 CENTRES_AROUND = 6
 COARSE = 2000
 LEAST_SHARE = 0.004
+NEAR_SHARE = 50
 WORST_POWER = 2.0
 # A sample that its leaf does not see costs more than its distance behind what is seen: it leaves a sliver beyond a
 # fissure that no leaf tells (liver A of 8 pieces: 0.326 → 0.274 mm).
@@ -183,7 +184,7 @@ def best_centre(
     all members, in mm (for power 1) and samples, from the few that are looked at.
     """
     inner = np.flatnonzero(region.holds(solid.inner))
-    few = members[:: max(members.size // COARSE, 1)].copy()
+    few = members[:: -(-members.size // COARSE)].copy()
     if inner.size == 0:
         middle = solid.samples.points[members].mean(axis=0)
         inner = np.array([int(((solid.inner - middle) ** 2).sum(axis=1).argmin())])
@@ -212,13 +213,11 @@ def _seen_from(solid: Solid, inner: IntArray, few: IntArray, power: float) -> tu
 
 def hidden(solid: Solid, centres: FloatArray, members: IntArray) -> FloatArray:
     """Return (c, m) how far (mm) each member lies behind the first surface that a centre sees; 0 where it is seen."""
-    points = solid.samples.points[members]
-    offset = points[None, :, :] - centres[:, None, :]
-    r = np.sqrt((offset**2).sum(axis=2))
-    directions = (offset / np.maximum(r, 1e-12)[:, :, None]).reshape(-1, 3)
-    hit, _ = solid.triangles.first_hit(np.repeat(centres, members.size, axis=0), directions)
-    gap = r - np.where(np.isfinite(hit), hit, np.inf).reshape(r.shape)
-    return np.where(gap > 1e-5 * solid.size, gap, 0.0)
+    offset = solid.samples.points[members][None, :, :] - centres[:, None, :]
+    flat = offset.reshape(-1, 3)
+    share = solid.triangles.first_hit(np.repeat(centres, members.size, axis=0), flat, 1.0)[0]
+    gap = np.sqrt((flat**2).sum(axis=1)) * (1.0 - np.where(np.isfinite(share), share, 1.0))
+    return np.where(gap > 1e-5 * solid.size, gap, 0.0).reshape(offset.shape[:2])
 
 
 def hidden_costs(solid: Solid, centres: FloatArray, members: IntArray, power: float) -> FloatArray:
@@ -227,8 +226,11 @@ def hidden_costs(solid: Solid, centres: FloatArray, members: IntArray, power: fl
     return costs
 
 
-def best_split(solid: Solid, piece: Piece, power: float) -> Split | None:
-    """Return the best cut of a piece, or None where neither side could have a centre."""
+def best_split(solid: Solid, piece: Piece, power: float, spot: FloatArray | None = None) -> Split | None:
+    """Return the best cut of a piece, or None where neither side could have a centre.
+
+    spot: (3,) around which members count more, as much as half of all: a cut for what is missed there.
+    """
     least = max(int(LEAST_SHARE * solid.samples.points.shape[0]), 8)
     if piece.members.size < 2 * least or piece.depth >= MAX_DEPTH:
         return None
@@ -236,7 +238,11 @@ def best_split(solid: Solid, piece: Piece, power: float) -> Split | None:
     if inner.size < 2:
         return None
     chosen = solid.inner[inner[_spread(solid.inner[inner], solid.depth[inner], CENTRES)]]
-    few = piece.members[:: max(piece.members.size // COARSE, 1)].copy()
+    few = piece.members[:: -(-piece.members.size // COARSE)].copy()
+    if spot is not None:
+        apart = ((solid.samples.points[piece.members] - spot) ** 2).sum(axis=1)
+        near = piece.members[np.argsort(apart, kind="stable")[: max(piece.members.size // NEAR_SHARE, 8)]]
+        few = np.concatenate([few, np.repeat(near, max(few.size // (2 * near.size), 1))])
     gaps = hidden_costs(solid, chosen, few, power)
     view = _View(solid, few, gaps, chosen, least * few.size / piece.members.size, power)
     normal, offset, value = view.best_plane(fibonacci_sphere(2 * DIRECTIONS)[:DIRECTIONS], None, None)

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from hhsr.errors import InputError
 
 RECIPES = ("default", "paper")
+BASES = ("ellipsoid", "turned", "any")
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,10 @@ class FitOptions:
     ----------
     max_parameters : most numbers that may be stored (`Shape.parameters` ≤ this), ≥ 16; None: what the error asks for.
     max_mean_error_mm, max_error_mm : stop spending when the two-sided mean / sampled maximum is below; None: no goal.
+    max_error_weight : what the largest miss counts beside the mean, 0 … 1, where the default recipe chooses: 0.1 lowers
+        maxima and costs some of the mean.
+    bases : what the default recipe's leaves may buy where it brings more than as many centres: "ellipsoid": nothing
+        beyond six half axes; "turned": axes of their own; "any": exponents and knots too, which queries pay for.
     retain : keep the whole mesh as one retained part (a vessel tree); the budget is then not asked.
     recipe : "default", or "paper": mutex cuts by Eq. 9, superquadrics with spline exponents, uniform centres, bands.
     seed : of every random choice.
@@ -40,6 +45,8 @@ class FitOptions:
     max_parameters: int | None = None
     max_mean_error_mm: float | None = None
     max_error_mm: float | None = None
+    max_error_weight: float = 0.01
+    bases: Literal["ellipsoid", "turned", "any"] = "ellipsoid"
     retain: bool = False
     recipe: Literal["default", "paper"] = "default"
     seed: int = 0
@@ -55,6 +62,8 @@ class FitOptions:
         """Refuse what no fit can keep."""
         if self.recipe not in RECIPES:
             raise InputError(f"recipe: got {self.recipe!r}, expected one of {', '.join(RECIPES)}")
+        if self.bases not in BASES:
+            raise InputError(f"bases: got {self.bases!r}, expected one of {', '.join(BASES)}")
         if self.max_parameters is not None:
             _whole("max_parameters", self.max_parameters, 16, 10_000_000)
         _whole("seed", self.seed, 0, 2**63 - 1)
@@ -62,6 +71,7 @@ class FitOptions:
         _whole("samples", self.samples, 1000, 10_000_000)
         for name in ("max_mean_error_mm", "max_error_mm", "t_mm", "t3_mm"):
             _number(name, getattr(self, name), math.nextafter(0.0, 1.0), math.inf)
+        _number("max_error_weight", self.max_error_weight, 0.0, 1.0)
         _number("t1", self.t1, 0.0, 1.0)
         _number("t2_mm3", self.t2_mm3, 0.0, math.inf)
         _number("half_width_mm", self.half_width_mm, 0.0, math.inf)

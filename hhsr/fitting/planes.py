@@ -38,7 +38,7 @@ def _misfit(layout: Layout) -> float:
 
 def _moved_planes(solid: Solid, layout: Layout, power: float) -> list[tuple[FloatArray, float]]:
     """Return the planes after each was turned and shifted, ever finer, as long as that lowers the misfit."""
-    few = np.arange(0, solid.samples.points.shape[0], max(solid.samples.points.shape[0] // SAMPLES, 1))
+    few = np.arange(0, solid.samples.points.shape[0], -(-solid.samples.points.shape[0] // SAMPLES))
     points, slopes = solid.samples.points[few], solid.samples.normals[few]
     centres = np.array([piece.centre for piece in layout.pieces])
     gaps = hidden_costs(solid, centres, few, power)

@@ -7,6 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from hhsr.errors import FitError
+from hhsr.fitting.aim import aim_of
+from hhsr.fitting.base import ANY, TURNED
+from hhsr.fitting.goals import enough
+from hhsr.fitting.keep import affordable
 from hhsr.fitting.leaves import LEAF_NUMBERS, SCOUT, THOROUGH, Effort, Fitted, Workshop, fit_leaves
 from hhsr.fitting.lookahead import WORST_POWER, Layout, Parting, best_split
 from hhsr.fitting.normalise import on_grid, scaled
@@ -14,12 +18,12 @@ from hhsr.fitting.options import FitOptions
 from hhsr.fitting.planes import settled
 from hhsr.fitting.quantise import quantised
 from hhsr.fitting.solid import solid_of
-from hhsr.model import FloatArray, IntArray, Node
+from hhsr.model import FloatArray, IntArray, Node, RetainedPart
 
+KINDS = {"ellipsoid": (), "turned": TURNED, "any": ANY}
 POSE_NUMBERS = 6
 CUT_NUMBERS = 3
 USUAL_NUMBERS = 1000
-MOST_NUMBERS = 20_000
 SAMPLES_A_NUMBER = 12
 SAMPLES = (6_000, 40_000)
 NUMBERS_A_PIECE = 16
@@ -27,9 +31,11 @@ MOST_PIECES = 32
 PATIENCE = 4
 EACH_UP_TO = 6
 HIDDEN = 0.03
-SPIKE = 10.0
+SPIKE = 12.0
 MENDED = 2
 PRUNED = 2
+FINALISTS = 2
+NEARLY = 1.1
 PRUNING_PAYS = 0.98
 
 
@@ -64,53 +70,76 @@ def fit_default(vertices: FloatArray, faces: IntArray, options: FitOptions) -> N
     FitError : the budget cannot hold a pose and one leaf.
     """
     unit, size = on_grid(vertices, np.unique(faces))
-    return quantised(scaled(_fit_unit(unit, faces, options, size), size))
+    aim = aim_of(options.max_error_weight)
+
+    def fitted(budget: int) -> Node:
+        samples = int(np.clip(SAMPLES_A_NUMBER * budget, *SAMPLES))
+        solid = solid_of(unit, faces, samples, options.seed)
+        return quantised(scaled(_spent(Workshop(solid, aim, KINDS[options.bases]), budget, size), size))
+
+    if options.max_mean_error_mm is None and options.max_error_mm is None:
+        return fitted(options.max_parameters if options.max_parameters is not None else USUAL_NUMBERS)
+    return enough(fitted, vertices, faces, options)
 
 
-def _fit_unit(vertices: FloatArray, faces: IntArray, options: FitOptions, size_mm: float) -> Node:
-    """Return the tree's root for a surface whose longest side is 1, of a size in mm."""
-    expected = options.max_parameters if options.max_parameters is not None else USUAL_NUMBERS
-    samples = int(np.clip(SAMPLES_A_NUMBER * expected, *SAMPLES))
-    solid = solid_of(vertices, faces, samples, options.seed)
-    parting, workshop = Parting(solid), Workshop(solid)
-    goals = options.max_mean_error_mm, options.max_error_mm
-    mean, largest = (goal / size_mm if goal is not None else np.inf for goal in goals)
-    if goals == (None, None):
-        return _spent(workshop, parting, expected)[0]
-    most = options.max_parameters if options.max_parameters is not None else MOST_NUMBERS
-    budget = min(64, most)
-    while True:
-        node, fitted = _spent(workshop, parting, budget)
-        if (fitted.mean <= mean and fitted.largest <= largest) or budget >= most:
-            return node
-        budget = min(budget + budget // 2, most)
-
-
-def _spent(workshop: Workshop, parting: Parting, budget: int) -> tuple[Node, Fitted]:
-    """Return the best tree within a budget of numbers, and how it fits."""
+def _spent(workshop: Workshop, budget: int, size_mm: float) -> Node:
+    """Return the best tree within a budget of numbers. size_mm: of the solid's unit."""
     if budget < POSE_NUMBERS + LEAF_NUMBERS:
         raise FitError(
             f"max_parameters: got {budget}, expected at least {POSE_NUMBERS + LEAF_NUMBERS}: a pose and one ellipsoid"
         )
-    scouts = _scouts(workshop, parting, budget)
-    best = _mended(workshop, min(scouts, key=lambda choice: choice.score), budget)
-    best = _pruned(workshop, best, budget)
-    fitted = _fit(workshop, best.layout, budget, THOROUGH)
-    return best.layout.tree(fitted.leaves), fitted
+    parting = Parting(workshop.solid)
+    if whole := affordable(workshop.solid, parting.pieces(1), budget - POSE_NUMBERS, size_mm):
+        return whole[0]
+    scouts = sorted(_scouts(workshop, parting, budget), key=lambda choice: choice.score)
+    near = [choice for choice in scouts[:FINALISTS] if choice.score <= NEARLY * scouts[0].score]
+    better = [_pruned(workshop, _mended(workshop, choice, budget), budget) for choice in near]
+    finalists = [Choice(choice.layout, _fit(workshop, choice.layout, budget, THOROUGH)) for choice in better]
+    best = min(finalists, key=lambda choice: choice.score)
+    return best.layout.tree(_kept(workshop, best, budget, size_mm))
+
+
+def _kept(workshop: Workshop, best: Choice, budget: int, size_mm: float) -> list[Node]:
+    """Return the leaves, those kept as triangles whose numbers, spent on others, make the whole better."""
+    numbers, pieces = _numbers(best.layout, budget), best.layout.pieces
+    parts = affordable(workshop.solid, pieces, numbers - LEAF_NUMBERS * (best.pieces - 1), size_mm)
+    leaves: list[Node] = list(best.fitted.leaves)
+    kept: dict[int, RetainedPart] = {}
+    score = best.score
+    for k in sorted(parts, key=lambda k: parts[k].parameters):
+        tried = {**kept, k: parts[k]}
+        rest = [i for i in range(best.pieces) if i not in tried]
+        room = numbers - sum(part.parameters for part in tried.values())
+        if not rest or room < LEAF_NUMBERS * len(rest):
+            continue
+        fitted = fit_leaves(workshop, [pieces[i] for i in rest], room, THOROUGH)
+        share = sum(pieces[i].members.size for i in rest) / len(workshop.solid.samples.points)
+        if (after := share * fitted.mean + fitted.worst * fitted.largest) < score:
+            kept, score = tried, after
+            for i, leaf in zip(rest, fitted.leaves, strict=True):
+                leaves[i] = leaf
+            leaves[k] = parts[k]
+    return leaves
 
 
 def _mended(workshop: Workshop, best: Choice, budget: int) -> Choice:
     """Return the layout with cuts through the pieces of the largest misses, as long as that pays."""
     while best.fitted.largest > SPIKE * best.fitted.mean and best.pieces < budget // NUMBERS_A_PIECE:
         order = np.argsort(best.fitted.largests)[::-1][:MENDED]
-        splits = [(int(k), best_split(workshop.solid, best.layout.pieces[k], WORST_POWER)) for k in order]
-        layouts = [best.layout.split(k, split) for k, split in splits if split is not None]
+        layouts = [layout for k in order for layout in _mends(workshop, best, int(k))]
         tried = [Choice(layout, _fit(workshop, layout, budget, SCOUT)) for layout in layouts]
         paying = [choice for choice in tried if choice.score < best.score]
         if not paying:
             break
         best = min(paying, key=lambda choice: choice.score)
     return best
+
+
+def _mends(workshop: Workshop, choice: Choice, piece: int) -> list[Layout]:
+    """Return layouts with a piece cut for its largest miss: by look-ahead on squares, and for the spot where it is."""
+    solid, whole, spot = workshop.solid, choice.layout.pieces[piece], choice.fitted.spots[piece]
+    splits = best_split(solid, whole, WORST_POWER), best_split(solid, whole, 1.0, spot)
+    return [choice.layout.split(piece, split) for split in splits if split is not None]
 
 
 def _pruned(workshop: Workshop, best: Choice, budget: int) -> Choice:
@@ -158,5 +187,9 @@ def _hopeless(parting: Parting, count: int) -> bool:
 
 def _fit(workshop: Workshop, layout: Layout, budget: int, effort: Effort) -> Fitted:
     """Return the fitted leaves of a layout's pieces."""
-    numbers = budget - POSE_NUMBERS - CUT_NUMBERS * len(layout.planes)
-    return fit_leaves(workshop, layout.pieces, numbers, effort)
+    return fit_leaves(workshop, layout.pieces, _numbers(layout, budget), effort)
+
+
+def _numbers(layout: Layout, budget: int) -> int:
+    """Return how many numbers of a budget a layout leaves to its leaves."""
+    return budget - POSE_NUMBERS - CUT_NUMBERS * len(layout.planes)

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from hhsr.fitting.base import base_radii, base_slopes, local
 from hhsr.fitting.rows import GRAZING, Rows
-from hhsr.fitting.scale_field import ellipsoid_radii, leaf_of, ridge_of
+from hhsr.fitting.scale_field import ridge_of
 from hhsr.fitting.section import Section
 from hhsr.fitting.solid import Solid
 from hhsr.fitting.task import BOUND_RAYS, HOLD, RAYS, Task, ray_share
-from hhsr.kernels.refinement import chosen_rows, field_values, normal_equations
+from hhsr.kernels.refinement import (
+    chosen_rows,
+    field_values,
+    normal_equations,
+    own_misses,
+)
 from hhsr.kernels.selection import solve_normal
-from hhsr.model import MAX_SCALE, FloatArray, IntArray, ModelLeaf, ScaleField
+from hhsr.model import MAX_SCALE, FloatArray, IntArray, ModelLeaf, ScaleField, Superquadric
 
 AXES_DAMPING = 1e-3
 LONGEST_STEP = 0.2
+FARTHEST_LOGIT = 6.0
+SHARES = (1.0, 0.5, 0.25)
 
 
 class View(NamedTuple):
@@ -51,35 +60,45 @@ class Figures(NamedTuple):
     """How a leaf fits, but for samples that its centre does not see.
 
     total: sum of its misses, mm · samples, half of either way. largest: mm. surface: (n, 3) points of its own surface,
-    and of its planes where it leaves voids.
+    and of its planes where it leaves voids. normals: (n, 3) of the source where it stands for samples, elsewhere 0.
+    spot: (3,) where the largest is.
     """
 
     total: float
     largest: float
     surface: FloatArray
+    normals: FloatArray
+    spot: FloatArray
 
 
-def view_of(task: Task, field: ScaleField) -> View:
-    """Return a field's centres as seen in the directions of a task."""
-    grid, index = field.grid, field.index
+def view_of(directions: FloatArray, leaf: ModelLeaf) -> View:
+    """Return a leaf's centres as seen in (n, 3) unit directions of the tree's frame."""
+    grid, index = leaf.scale_field.grid, leaf.scale_field.index
     centres = np.ascontiguousarray(grid.centres[index]) if index.size else np.zeros((0, 3))
     extents = grid.extents[index] if index.size else np.zeros(0)
-    return View(*chosen_rows(task.directions, centres, extents))
+    return View(*chosen_rows(np.ascontiguousarray(local(leaf, directions)), centres, extents))
 
 
-def improved(solid: Solid, task: Task, leaf: ModelLeaf, steps: int, power: float) -> tuple[ModelLeaf, Misses]:
+def improved(
+    solid: Solid, task: Task, leaf: ModelLeaf, view: View, steps: int, power: float
+) -> tuple[ModelLeaf, Misses]:
     """Return the leaf after some Gauss-Newton steps on its misses, as long as they fall, and its misses.
 
-    power: of the misses whose sum is to fall (2: least squares, 1: their mean).
+    view: of the task's directions. power: of the misses whose sum is to fall (2: least squares, 1: their mean). A step
+    that does not help is halved, twice at most.
     """
-    view = view_of(task, leaf.scale_field)
     found = misses(task, solid, leaf, view)
     weight = weights_of(found, solid, power)
     for _ in range(steps):
-        tried = _step(task, found, weight, leaf, view)
-        after = misses(task, solid, tried, view)
-        other = weights_of(after, solid, power)
-        if (other * after.miss**2).sum() >= (weight * found.miss**2).sum():
+        change = _change(task, found, weight, leaf, view)
+        cost = (weight * found.miss**2).sum()
+        for share in SHARES:
+            tried = _changed(leaf, share * change)
+            after = misses(task, solid, tried, view)
+            other = weights_of(after, solid, power)
+            if better := bool((other * after.miss**2).sum() < cost):
+                break
+        if not better:
             break
         leaf, found, weight = tried, after, other
     return leaf, found
@@ -87,49 +106,56 @@ def improved(solid: Solid, task: Task, leaf: ModelLeaf, steps: int, power: float
 
 def mending_rows(task: Task, found: Misses) -> Rows:
     """Return the rows that ask for a leaf like the one with these misses, without them."""
-    kept = found.share > 0.0
     wanted = found.radius - found.miss / found.slope
     weights = np.sqrt(found.share) * np.abs(found.slope)
-    return Rows(task.directions[kept], wanted[kept], weights[kept], np.zeros(int(kept.sum()), dtype=bool))
+    return Rows(task.directions, wanted, weights, np.zeros(weights.size, dtype=bool))
 
 
-def figures(solid: Solid, task: Task, section: Section, leaf: ModelLeaf, found: Misses) -> Figures:
-    """Return how a leaf fits, voids behind cuts by their depth."""
-    told = found.share[: found.near] > 0.0
-    miss = np.abs(found.miss[: found.near])[told]
-    void = radii_of(leaf, section.along) < section.reach
+def figures(
+    solid: Solid, task: Task, section: Section, leaf: ModelLeaf, found: Misses, view: View | None = None
+) -> Figures:
+    """Return how a leaf fits, voids behind cuts by their depth. view: of the section's directions, if there is one."""
+    own = np.flatnonzero(found.share[: found.near] > 0.0)
+    miss = np.abs(found.miss[own])
+    void = radii_of(leaf, section.along, view) < section.reach
     lost = float(section.depth[void].sum()) * section.cell / (solid.sample_area * task.stride)
-    total = 0.5 * (float((miss * found.share[: found.near][told]).sum()) + lost)
-    own = np.arange(task.along.shape[0], found.near)[told[task.along.shape[0] :]]
+    total = 0.5 * (float((miss * found.share[own]).sum()) + lost)
     surface = leaf.centre + np.concatenate(
         [found.radius[own, None] * task.directions[own], section.reach[void, None] * section.along[void]]
     )
-    return Figures(total, max(float(a.max(initial=0.0)) for a in (miss, section.depth[void])), surface)
+    normals = np.zeros(surface.shape)
+    normals[: task.along.shape[0]] = task.normals[task.seen]
+    missed = np.concatenate([miss, section.depth[void]])
+    if missed.size == 0:
+        return Figures(total, 0.0, surface, normals, leaf.centre)
+    worst = int(missed.argmax())
+    return Figures(total, float(missed[worst]), surface, normals, surface[worst])
 
 
-def radii_of(leaf: ModelLeaf, directions: FloatArray) -> FloatArray:
-    """Return (n,) radii, mm, of a leaf on the tree's axes."""
-    field = leaf.scale_field
-    centres = np.ascontiguousarray(field.grid.centres[field.index]) if field.index.size else np.zeros((0, 3))
-    extents = field.grid.extents[field.index] if field.index.size else np.zeros(0)
-    view = View(*chosen_rows(np.ascontiguousarray(directions), centres, extents))
-    radii: FloatArray = (1.0 - view.scales(leaf)) * ellipsoid_radii(np.asarray(leaf.superquadric.half_axes), directions)
+def radii_of(leaf: ModelLeaf, directions: FloatArray, view: View | None = None) -> FloatArray:
+    """Return (n,) radii, mm, of a leaf on the tree's axes. view: of these directions, where there is one."""
+    seen = view_of(directions, leaf) if view is None else view
+    radii: FloatArray = (1.0 - seen.scales(leaf)) * base_radii(leaf, directions)
     return radii
 
 
-def misses(task: Task, solid: Solid, leaf: ModelLeaf, view: View) -> Misses:
+def misses(task: Task, solid: Solid, leaf: ModelLeaf, view: View, own: Misses | None = None) -> Misses:
     """Return what a leaf misses, both ways: samples that it should meet, its own points that should lie on the source.
 
     And behind cuts: where it falls short of its bounds, and (weak) how far it strays from its base.
+    own: the leaf's misses for a task that differs in its bounds only: what they say of samples and own points stays.
     """
-    base = ellipsoid_radii(np.asarray(leaf.superquadric.half_axes), task.directions)
+    base = base_radii(leaf, task.directions)
     radius = (1.0 - view.scales(leaf)) * base
     miss, slope, share = np.zeros(radius.size), np.ones(radius.size), np.zeros(radius.size)
     first, second = task.along.shape[0], task.along.shape[0] + task.free.shape[0]
-    slope[:first] = np.maximum(task.cosine, GRAZING)
-    miss[:first] = slope[:first] * (radius[:first] - task.radii)
-    share[:first] = 1.0
-    _own_misses(task, solid, leaf, *(a[first:second] for a in (radius, miss, slope, share)))
+    if own is None:
+        slope[:first] = np.maximum(task.cosine, GRAZING)
+        miss[:first] = slope[:first] * (radius[:first] - task.radii)
+        share[:first] = 1.0
+        _own_misses(task, solid, leaf, *(a[first:second] for a in (radius, miss, slope, share)))
+    else:
+        miss[:second], slope[:second], share[:second] = own.miss[:second], own.slope[:second], own.share[:second]
     short = radius[second:] < task.bound
     miss[second:] = radius[second:] - np.where(short, task.bound, np.maximum(base[second:], task.bound))
     share[second:] = ray_share(solid, BOUND_RAYS) * (task.bound * np.where(short, task.urgency, HOLD)) ** 2
@@ -156,40 +182,53 @@ def _own_misses(
     share: FloatArray,
 ) -> None:
     """Fill in the true signed distances of the leaf's own points, within its region, to the source."""
-    ends = leaf.centre + radius[:, None] * task.free
-    within = np.flatnonzero(task.region.holds(ends))
-    ends, free = ends[within], task.free[within]
-    distance, nearest, face = solid.triangles.closest(ends)
-    corner = solid.vertices[solid.faces[face]]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal /= np.maximum(np.sqrt((normal**2).sum(axis=1)), 1e-300)[:, None]
-    side = np.where(np.einsum("ni,ni->n", ends - nearest, normal) < 0.0, -1.0, 1.0)
-    apart = distance > 1e-6 * solid.size
-    outward = np.where(apart[:, None], side[:, None] * (ends - nearest) / np.maximum(distance, 1e-300)[:, None], normal)
-    steep = np.einsum("ni,ni->n", outward, free)
-    steep = np.where(np.abs(steep) < GRAZING, np.copysign(GRAZING, steep), steep)
-    miss[within] = side * distance
-    slope[within] = steep
-    share[within] = ray_share(solid, RAYS) * radius[within] ** 2 / np.abs(steep)
+    boxes, links, corners, _ = solid.triangles.arrays
+    normals, offsets = task.region
+    least, area = 1e-6 * solid.size, ray_share(solid, RAYS)
+    own_misses(
+        boxes,
+        links,
+        corners,
+        normals,
+        offsets,
+        leaf.centre,
+        task.free,
+        radius,
+        GRAZING,
+        least,
+        area,
+        miss,
+        slope,
+        share,
+    )
 
 
-def _step(task: Task, found: Misses, weight: FloatArray, leaf: ModelLeaf, view: View) -> ModelLeaf:
-    """Return the leaf after one Gauss-Newton step: ridge on the weights, damping on the half axes' logarithms."""
-    field, axes = leaf.scale_field, np.asarray(leaf.superquadric.half_axes)
-    u = task.directions
+def _change(task: Task, found: Misses, weight: FloatArray, leaf: ModelLeaf, view: View) -> FloatArray:
+    """Return a Gauss-Newton step of weights (with a ridge), half axes' logarithms and logits (with a damping)."""
+    field = leaf.scale_field
     s = view.scales(leaf)
-    q = ellipsoid_radii(axes, u)
-    seen = np.where(u >= 0.0, axes[0::2], axes[1::2])
-    by_axis = (found.slope * (1.0 - s) * q**3)[:, None] * (u / seen) ** 2
-    by_half = np.stack([by_axis * (u >= 0.0), by_axis * (u < 0.0)], axis=2).reshape(-1, 6)
+    q = base_radii(leaf, task.directions)
+    by_base = (found.slope * (1.0 - s))[:, None] * base_slopes(leaf, task.directions, q)
     slope = np.where(s < MAX_SCALE, -found.slope * q, 0.0)
     count = field.weights.size
-    matrix, right = normal_equations(*view, slope, by_half, found.miss, weight, count)
+    matrix, right = normal_equations(*view, slope, by_base, found.miss, weight, count)
     diagonal = np.diag(matrix)
     mean = float(diagonal[:count].mean()) if count else 0.0
     floor = ridge_of(field.grid.extents[field.index]) * mean if count else np.zeros(0)
     damping = np.concatenate([floor, AXES_DAMPING * diagonal[count:] + 1e-12 * (1.0 + diagonal.max())])
     right[:count] -= floor * field.weights
-    change = solve_normal(matrix + np.diag(damping), right)
-    half_axes = axes * np.exp(np.clip(change[count:], -LONGEST_STEP, LONGEST_STEP))
-    return leaf_of(leaf.centre, half_axes, ScaleField(field.grid, field.index, field.weights + change[:count]))
+    change: FloatArray = solve_normal(matrix + np.diag(damping), right)
+    return change
+
+
+def _changed(leaf: ModelLeaf, change: FloatArray) -> ModelLeaf:
+    """Return the leaf with its weights, the logarithms of its half axes and its logits changed."""
+    field, base, count = leaf.scale_field, leaf.superquadric, leaf.scale_field.weights.size
+    moved = np.clip(change[count:], -LONGEST_STEP, LONGEST_STEP)
+    logits = np.concatenate([base.azimuth_logits, base.elevation_logits]) + moved[6:]
+    azimuth, elevation = np.split(np.clip(logits, -FARTHEST_LOGIT, FARTHEST_LOGIT), [base.azimuth_logits.size])
+    return replace(
+        leaf,
+        superquadric=Superquadric(np.asarray(base.half_axes) * np.exp(moved[:6]), azimuth, elevation),
+        scale_field=ScaleField(field.grid, field.index, field.weights + change[:count]),
+    )

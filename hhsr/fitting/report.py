@@ -58,19 +58,37 @@ def measure(
         nothing = float(np.linalg.norm(np.ptp(source_vertices, axis=0)))
         figures = ErrorFigures(nothing, nothing, nothing)
         return Measured(figures, (figures,) * count, report)
-    on_source = area_samples(source_vertices, source_faces, samples, seed).points
-    on_mesh = area_samples(np.asarray(mesh.vertices), np.asarray(mesh.faces), samples, seed + 1).points
-    there, foot, _ = TriangleTree(mesh.vertices, mesh.faces).closest(on_source)
-    back, root_foot, _ = TriangleTree(source_vertices, source_faces).closest(on_mesh)
-    distance = np.concatenate([there, back])
-    owner = owners(tree, np.concatenate([on_source, on_mesh]))
-    other = owners(tree, np.concatenate([foot, root_foot]))
+    distance, points, feet = _distances(mesh, source_vertices, source_faces, samples, seed)
+    owner, other = owners(tree, points), owners(tree, feet)
     whole = figures_of(distance)
     per_leaf = tuple(figures_of(distance[(owner == i) | (other == i)]) for i in range(count))
     spacing = float(np.sqrt(face_areas(source_vertices, source_faces).sum() / samples))
-    places = np.concatenate([on_source, on_mesh, foot, root_foot])
-    report[KEY] = encoded(_largest_of_cells(tree, places, np.tile(distance, 2), spacing), whole, per_leaf)
+    report[KEY] = encoded(
+        _largest_of_cells(tree, np.concatenate([points, feet]), np.tile(distance, 2), spacing), whole, per_leaf
+    )
     return Measured(whole, per_leaf, report)
+
+
+def error_of(
+    shape: Shape, source_vertices: FloatArray, source_faces: IntArray, samples: int = 20_000, seed: int = 0
+) -> ErrorFigures:
+    """Return how far a shape and its source are apart, mm, as `measure` has it."""
+    mesh = shape.mesh()
+    if len(mesh.faces) == 0:
+        return ErrorFigures(*[float(np.linalg.norm(np.ptp(source_vertices, axis=0)))] * 3)
+    return figures_of(_distances(mesh, source_vertices, source_faces, samples, seed)[0])
+
+
+def _distances(
+    mesh: trimesh.Trimesh, vertices: FloatArray, faces: IntArray, samples: int, seed: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return distances (2n,) mm, points (2n, 3) on source and mesh, and the point of the other nearest to each."""
+    on_source = area_samples(vertices, faces, samples, seed).points
+    on_mesh = area_samples(np.asarray(mesh.vertices), np.asarray(mesh.faces), samples, seed + 1).points
+    there, foot, _ = TriangleTree(mesh.vertices, mesh.faces).closest(on_source)
+    back, root_foot, _ = TriangleTree(vertices, faces).closest(on_mesh)
+    points, feet = np.concatenate([on_source, on_mesh]), np.concatenate([foot, root_foot])
+    return np.concatenate([there, back]), points, feet
 
 
 def _largest_of_cells(tree: Tree, points: FloatArray, distance: FloatArray, spacing: float) -> FloatArray:

@@ -13,7 +13,10 @@ OVERHANG_MM = 1.0
 
 
 def retained_part(
-    vertices: FloatArray, faces: IntArray, planes: tuple[tuple[Plane, int], ...] | list[tuple[Plane, int]] = ()
+    vertices: FloatArray,
+    faces: IntArray,
+    planes: tuple[tuple[Plane, int], ...] | list[tuple[Plane, int]] = (),
+    overhang: float = OVERHANG_MM,
 ) -> RetainedPart:
     """Return the triangles of a region, running 1 mm past each of its planes and capped there, outside the region.
 
@@ -21,11 +24,12 @@ def retained_part(
     ----------
     vertices, faces : (n, 3) mm, (m, 3) closed triangles of the whole source.
     planes : pairs of a plane and the side of it (+1 right, −1 left) that the region is on; none: the whole, as it is.
+    overhang : how far the triangles run past the planes, where the unit is not the millimetre.
 
     A region that the source does not reach gives an empty part.
     """
     if planes:
-        vertices, faces = trim(vertices, faces, list(planes), OVERHANG_MM)
+        vertices, faces = trim(vertices, faces, list(planes), overhang)
     used, compact = np.unique(faces, return_inverse=True)
     return RetainedPart(frozen(vertices[used].reshape(-1, 3)), frozen(compact.reshape(-1, 3), np.int64))
 

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from hhsr.fitting.base import base_radii, local
 from hhsr.fitting.rows import Rows
-from hhsr.kernels.greedy import orthogonal_selection
-from hhsr.kernels.refinement import chosen_rows
-from hhsr.kernels.selection import atoms_of_cells, back_substituted, dictionary_rows, drop_costs, solve_normal
+from hhsr.kernels.greedy import begin, extend, triangle_of
+from hhsr.kernels.refinement import chosen_rows, ellipsoid_radii, normal_equations
+from hhsr.kernels.selection import (
+    atoms_of_cells,
+    back_substituted,
+    dictionary_rows,
+    drop_costs,
+    solve_normal,
+    transposed,
+)
 from hhsr.model import CentreGrid, FloatArray, IntArray, ModelLeaf, ScaleField, Superquadric
 
 RATIO = 1.5
@@ -24,27 +31,81 @@ NO_ROTATION = np.zeros(0)
 NONE = np.zeros(0, np.int64)
 
 
-class Selection(NamedTuple):
-    """Centres of one leaf in the order in which they pay, the first `held` of them kept from before.
-
-    atoms: (k,) indices into the grid. gains: (k,) fall of the rows' sum of squares, mm². triangle, right: see
-    `hhsr.kernels.selection.orthogonal_selection`.
-    """
+class Atoms(NamedTuple):
+    """Which centres of a grid see which of (n, 3) directions: λ as compressed rows and as compressed columns."""
 
     grid: CentreGrid
-    atoms: IntArray
-    gains: FloatArray
-    triangle: FloatArray
-    right: FloatArray
-    held: int
+    row_starts: IntArray
+    row_atoms: IntArray
+    row_values: FloatArray
+    column_starts: IntArray
+    column_rows: IntArray
+    column_values: FloatArray
+
+
+def atoms_of(grid: CentreGrid, directions: FloatArray) -> Atoms:
+    """Return which centres of a grid see which of (n, 3) unit directions."""
+    found = dictionary(grid, directions)
+    return Atoms(grid, *found, *transposed(*found, grid.size))
+
+
+class Selection:
+    """Centres of one leaf in the order in which they pay, `held` of them kept from before; more are chosen when asked.
+
+    atoms: of the rows' directions. base: (n,) mm, the bare superquadric's radii there; bounds count if it breaks them.
+    """
+
+    def __init__(self, atoms: Atoms, rows: Rows, base: FloatArray, held: IntArray = NONE) -> None:
+        self.grid = atoms.grid
+        self.held = held.size
+        self.done = 0
+        self.complete = False
+        self._held = held
+        scale, target = _scale_and_target(rows, base)
+        self._start = float((target**2).sum())
+        diagonal, full, pull, usable = begin(*atoms[4:], scale, target, ridge_of(self.grid.extents))
+        self._system: tuple[Any, ...] = (*atoms[1:], scale, diagonal, full, usable, full.copy(), pull)
+        self._basis = np.zeros((0, self.grid.size), np.float32)
+        self._chosen, self._gains, self._right = np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
+
+    def extend(self, count: int) -> None:
+        """Choose up to `count` centres in all; `complete` says that there were no more."""
+        more = count - self._chosen.size
+        if more <= 0 or self.complete:
+            return
+        self._basis = np.concatenate([self._basis, np.zeros((more, self.grid.size), np.float32)])
+        self._chosen = np.concatenate([self._chosen, np.zeros(more, np.int64)])
+        self._gains = np.concatenate([self._gains, np.zeros(more)])
+        self._right = np.concatenate([self._right, np.zeros(more)])
+        found = (self._basis, self._chosen, self._gains, self._right)
+        arguments = (*self._system, *found, self.done, self._held)
+        self.done = int(extend(*arguments))
+        self.complete = self.done < count
+
+    @property
+    def atoms(self) -> IntArray:
+        """(k,) indices into the grid."""
+        return self._chosen[: self.done]
+
+    @property
+    def gains(self) -> FloatArray:
+        """(k,) falls of the rows' sum of squares, mm²."""
+        return self._gains[: self.done]
+
+    @property
+    def left(self) -> float:
+        """What the rows' sum of squares still is, mm²."""
+        return self._start - float(self.gains.sum())
 
     def field(self, count: int) -> ScaleField:
         """Return the scale field of the first `count` centres."""
-        weights = back_substituted(self.triangle, self.right, count)
-        order = np.argsort(self.atoms[:count], kind="stable")
-        return ScaleField(self.grid, self.atoms[:count][order], weights[order])
+        atoms = self._chosen[:count]
+        weights = back_substituted(triangle_of(self._basis, atoms), self._right, count)
+        order = np.argsort(atoms, kind="stable")
+        return ScaleField(self.grid, atoms[order], weights[order])
 
 
+@lru_cache(maxsize=8)
 def grid_for(finest: int) -> CentreGrid:
     """Return the dictionary whose finest grid has about `finest` centres; each coarser one is 1.5 times wider."""
     sizes = [max(finest, COARSEST)]
@@ -80,12 +141,6 @@ def ridge_of(extents: FloatArray) -> FloatArray:
     return ridge
 
 
-def ellipsoid_radii(half_axes: FloatArray, directions: FloatArray) -> FloatArray:
-    """Return (n,) radii q of the ellipsoid of six half axes in (n, 3) unit directions."""
-    radii: FloatArray = 1.0 / np.sqrt(((directions / _axes_seen(half_axes, directions)) ** 2).sum(axis=1))
-    return radii
-
-
 def _axes_seen(half_axes: FloatArray, directions: FloatArray) -> FloatArray:
     """Return (n, 3) the half axes of each direction's octant."""
     return np.where(directions >= 0.0, half_axes[0::2], half_axes[1::2])
@@ -117,37 +172,33 @@ def fit_ellipsoid(rows: Rows, iterations: int = 12) -> FloatArray:
 
 
 def select_centres(rows: Rows, half_axes: FloatArray, grid: CentreGrid, count: int, held: IntArray = NONE) -> Selection:
-    """Return up to `count` centres that bring the leaf nearest to the rows, the `held` ones among them.
-
-    Bounds count where the bare ellipsoid breaks them.
-    """
-    pointer, index, value, scale, target = _system(rows, half_axes, lambda u: dictionary(grid, u))
-    chosen, gains, triangle, right = orthogonal_selection(
-        pointer, index, value, scale, target, grid.size, count, ridge_of(grid.extents), held
-    )
-    return Selection(grid, chosen, gains, triangle, right, held.size)
+    """Return up to `count` centres that bring the leaf nearest to the rows, the `held` ones among them."""
+    base = ellipsoid_radii(half_axes, rows.directions)
+    selection = Selection(atoms_of(grid, rows.directions), rows, base, held)
+    selection.extend(count)
+    return selection
 
 
 def costs_of_dropping(rows: Rows, leaf: ModelLeaf) -> FloatArray:
     """Return (k,) by how much the rows' sum of squares (mm²) rises when a leaf loses one of its centres."""
     field = leaf.scale_field
     centres, extents = np.ascontiguousarray(field.grid.centres[field.index]), field.grid.extents[field.index]
-    system = _system(rows, np.asarray(leaf.superquadric.half_axes), lambda u: chosen_rows(u, centres, extents))
-    k = field.index.size
-    _, _, triangle, right = orthogonal_selection(*system, k, k, ridge_of(extents), np.arange(k))
-    costs: FloatArray = drop_costs(triangle, right)
+    scale, target = _scale_and_target(rows, base_radii(leaf, rows.directions))
+    seen = chosen_rows(np.ascontiguousarray(local(leaf, rows.directions)), centres, extents)
+    told = (scale > 0.0).astype(np.float64)
+    nothing = np.zeros((scale.size, 0))
+    pointer, index, value = seen
+    matrix, right = normal_equations(pointer, index, value, scale, nothing, -target, told, field.index.size)
+    diagonal = np.diag(matrix)
+    ridge = ridge_of(extents) * diagonal.sum() / max((diagonal > 0.0).sum(), 1)
+    costs: FloatArray = drop_costs(matrix + np.diag(ridge), right)
     return costs
 
 
-def _system(
-    rows: Rows, half_axes: FloatArray, atoms: Callable[[FloatArray], tuple[IntArray, IntArray, FloatArray]]
-) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]:
-    """Return the linear system that rows ask of the scale field: compressed λ, scale and target of each row."""
-    q = ellipsoid_radii(half_axes, rows.directions)
+def _scale_and_target(rows: Rows, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return (n,) scale and target of the linear system that rows ask of the scale field; scale 0: nothing."""
     weights = np.where(rows.bound & (q >= rows.radii), 0.0, rows.weights)
-    kept = np.flatnonzero(weights > 0.0)
-    pointer, index, value = atoms(np.ascontiguousarray(rows.directions[kept]))
-    return pointer, index, value, (weights * q)[kept], (weights * (q - rows.radii))[kept]
+    return weights * q, weights * (q - rows.radii)
 
 
 def leaf_of(centre: FloatArray, half_axes: FloatArray, field: ScaleField) -> ModelLeaf:

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hhsr.fitting.base import base_radii
 from hhsr.fitting.rows import GRAZING, BoolArray, Rows
-from hhsr.fitting.samples import turned_fibonacci
-from hhsr.fitting.scale_field import ellipsoid_radii
+from hhsr.fitting.samples import side_by_side, turned_fibonacci
 from hhsr.fitting.solid import Region, Solid
-from hhsr.model import FloatArray, IntArray
+from hhsr.model import FloatArray, IntArray, ModelLeaf
 
 RAYS = 2500
 BOUND_RAYS = 8000
@@ -59,10 +59,10 @@ def task_of(solid: Solid, region: Region, members: IntArray, centre: FloatArray,
     stride: one of so many samples and rays is taken.
     """
     members = members[::stride]
-    free = turned_fibonacci(RAYS, seed)[::stride]
+    free = side_by_side(turned_fibonacci(RAYS, seed)[::stride])
     reach, _, hit = _cast(solid, region, centre, free)
     free = free[~(np.isfinite(reach) & (hit > reach))]
-    behind = turned_fibonacci(BOUND_RAYS, seed + 1)[::stride]
+    behind = side_by_side(turned_fibonacci(BOUND_RAYS, seed + 1)[::stride])
     reach, cosine, hit = _cast(solid, region, centre, behind)
     through = np.isfinite(reach) & (hit > reach)
     behind, reach, cosine, hit = behind[through], reach[through], cosine[through], hit[through]
@@ -94,17 +94,29 @@ def task_of(solid: Solid, region: Region, members: IntArray, centre: FloatArray,
 def _cast(
     solid: Solid, region: Region, centre: FloatArray, directions: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return (n,) mm to the region's end (inf), the cosine there, and mm to the source's first surface (NaN)."""
+    """Return (n,) mm to the region's end (inf), the cosine there, and mm to the source's first surface.
+
+    Surface farther than 1.5 times the region's end is not looked for (inf), nor any where the region has no end (NaN).
+    """
     reach, cosine = region.exits(centre, directions)
-    return reach, cosine, solid.triangles.first_hit(np.broadcast_to(centre, directions.shape), directions)[0]
+    ends = np.isfinite(reach)
+    far = FARTHEST_HINT * np.maximum(reach[ends], 1e-9 * solid.size)
+    t = solid.triangles.first_hit(np.broadcast_to(centre, (far.size, 3)), far[:, None] * directions[ends], 1.0)[0]
+    hit = np.full(reach.size, np.nan)
+    hit[ends] = np.where(np.isfinite(t), t * far, np.inf if solid.triangles.contains(centre) else np.nan)
+    return reach, cosine, hit
 
 
 def _in_sight(solid: Solid, points: FloatArray, normals: FloatArray, centre: FloatArray) -> BoolArray:
     """Return (n,) which points of the surface a centre sees from inside, nothing between."""
-    radii, along = polar(points, centre)
-    first, _ = solid.triangles.first_hit(np.broadcast_to(centre, along.shape), along)
-    facing = np.einsum("ni,ni->n", along, normals) > 0.0
-    return np.asarray(facing & ~(first < radii * (1.0 - 1e-6) - 1e-6 * solid.size))
+    offset = points - centre
+    facing = np.flatnonzero(np.einsum("ni,ni->n", offset, normals) > 0.0)
+    radii = np.sqrt((offset[facing] ** 2).sum(axis=1))
+    near = 1.0 - 1e-6 - 1e-6 * solid.size / np.maximum(radii, 1e-6 * solid.size)
+    ends = offset[facing] * np.maximum(near, 0.0)[:, None]
+    seen = np.zeros(points.shape[0], dtype=bool)
+    seen[facing] = np.isnan(solid.triangles.first_hit(np.broadcast_to(centre, ends.shape), ends, 1.0)[0])
+    return seen
 
 
 def polar(points: FloatArray, centre: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -133,12 +145,20 @@ def hint_rows(task: Task, solid: Solid) -> Rows:
     return Rows(task.behind, task.hint, weight, np.zeros(task.hint.size, dtype=bool))
 
 
-def hold_rows(task: Task, solid: Solid, half_axes: FloatArray) -> Rows:
-    """Return rows, weak, that keep the leaf at its base, or at the bound, where nothing else tells it anything.
+def first_rows(task: Task, solid: Solid, leaf: ModelLeaf) -> Rows:
+    """Return the rows that the first centres are chosen for, one for each of the task's directions.
 
-    Without them the centres chosen for the surface beside a cut swing freely behind the cut, and open voids there
+    The samples in sight; and where the leaf is cut off the bounds that its base breaks. Elsewhere behind cuts, weakly,
+    the base: without that the centres chosen for the surface beside a cut swing freely behind it, and open voids there
     (a liver: 0.34 mm with, 0.45 mm and more without).
     """
-    wanted = np.maximum(ellipsoid_radii(half_axes, task.behind), task.bound)
-    weight = HOLD * np.sqrt(ray_share(solid, BOUND_RAYS)) * task.bound
-    return Rows(task.behind, wanted, weight, np.zeros(wanted.size, dtype=bool))
+    base = base_radii(leaf, task.behind)
+    weight = np.sqrt(ray_share(solid, BOUND_RAYS)) * task.bound
+    weight *= np.sqrt(HOLD**2 + np.where(base < task.bound, task.urgency, 0.0) ** 2)
+    free = np.zeros(task.free.shape[0])
+    return Rows(
+        task.directions,
+        np.concatenate([task.radii, free, np.maximum(base, task.bound)]),
+        np.concatenate([np.maximum(task.cosine, GRAZING), free, weight]),
+        np.zeros(task.directions.shape[0], dtype=bool),
+    )

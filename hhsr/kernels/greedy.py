@@ -5,8 +5,6 @@ import math
 import numpy as np
 from numba import njit
 
-from hhsr.kernels.selection import transposed
-
 BLOCK = 16
 CHUNK = 256
 FEWEST_ACTIVE = 512
@@ -14,36 +12,56 @@ ACTIVE_SHARE = 8
 
 
 @njit(cache=True, nogil=True)
-def orthogonal_selection(pointer, index, value, scale, target, columns, count, ridge, held):
-    """Choose atoms one by one, each the one that lowers Σ (scale_i · (A w)_i − target_i)² + Σ ridge_j w_j² the most.
+def begin(starts, rows, values, scale, target, ridge):
+    """Return what a selection starts from, nothing chosen: the normal matrix's diagonal, and pulls, of each atom.
+
+    starts, rows, values: columns of A, compressed. scale, target: (n,). ridge: (columns,), in units of the normal
+    matrix's mean diagonal. Returned: (columns,) diagonal without and with the ridge; pull Σ scale A target; which
+    atoms may be chosen.
+    """
+    diagonal, pull = _diagonal_and_pull(starts, rows, values, scale, target)
+    mean = diagonal.sum() / max((diagonal > 0.0).sum(), 1)
+    return diagonal, diagonal + ridge * mean, pull, diagonal > 1e-6 * ridge * mean
+
+
+@njit(cache=True, nogil=True)
+def extend(
+    pointer,
+    index,
+    value,
+    starts,
+    rows,
+    values,
+    scale,
+    diagonal,
+    full,
+    usable,
+    rest,
+    pull,
+    basis,
+    chosen,
+    gains,
+    right,
+    done,
+    held,
+):
+    """Choose atoms until `chosen` is full, each the one that lowers Σ (scale_i (A w)_i − target_i)² + Σ ridge w² most.
 
     Pivoted Cholesky of the normal equations, whose columns are formed only for the atoms chosen. It is held in single
     precision, which chooses the same atoms in a third of the time; the weights are solved again in double. Atoms are
     chosen in blocks of 1 … 16 among the most promising; the others are brought up to date once a block, in one pass
     over what is chosen (a block ends early where one of them may be better than what is left).
 
-    pointer, index, value: rows of A, compressed. scale, target: (n,). count: atoms at most.
-    ridge: (columns,), in units of the normal matrix's mean diagonal. held: atoms that are chosen before any other, in
-    this order.
-    Returns (k,) atoms in order, (k,) falls of the sum of squares, (k, k) lower triangle L of the chosen atoms' normal
-    matrix and (k,) y with L y = right side, so that the weights of the first m solve L[:m, :m]ᵀ w = y[:m].
+    pointer, index, value: rows of A, compressed; then its columns. scale, diagonal, full, usable: as given to and
+    returned by `begin`. rest, pull: (columns,) diagonal and pulls less what the atoms chosen so far explain; at first
+    `full` and what `begin` returned; changed here. basis: (k, columns) float32, chosen, gains, right: (k,), the first
+    `done` of them filled. held: atoms that are chosen before any other, in this order.
+    Returns how many are chosen; fewer than k where nothing more is gained.
     """
-    starts, rows, values = transposed(pointer, index, value, columns)
-    diagonal, pull = _diagonal_and_pull(starts, rows, values, scale, target, columns)
-    seen = max((diagonal > 0.0).sum(), 1)
-    mean = diagonal.sum() / seen
-    count = min(count, seen)
-    full = diagonal + ridge * mean
-    rest = full.copy()
-    usable = diagonal > 1e-6 * ridge * mean
-    basis = np.zeros((count, columns), np.float32)
-    chosen = np.empty(count, np.int64)
-    gains = np.empty(count)
-    right = np.empty(count)
+    count, columns = basis.shape
     place = np.full(columns, -1, np.int64)
     normal = np.empty((BLOCK, columns), np.float32)
     column = np.empty(columns)
-    done = 0
     while done < count:
         gain = _gains(pull, rest, full, usable)
         active, least = _active(gain, held[done : done + BLOCK])
@@ -77,16 +95,27 @@ def orthogonal_selection(pointer, index, value, scale, target, columns, count, r
             break
         _bring_up(basis, normal, near, chosen, right, begun, done, place, rest, pull)
         place[active] = -1
-    triangle = np.zeros((done, done))
-    for a in range(done):
-        for b in range(a + 1):
-            triangle[a, b] = basis[b, chosen[a]]
-    return chosen[:done].copy(), gains[:done].copy(), triangle, right[:done].copy()
+    return done
 
 
 @njit(cache=True, nogil=True)
-def _diagonal_and_pull(starts, rows, values, scale, target, columns):
+def triangle_of(basis, chosen):
+    """Return (k, k) the lower triangle L of the normal matrix of the k chosen atoms.
+
+    With y = `right` of `extend`, L y = right side: the weights of the first m solve L[:m, :m]ᵀ w = y[:m].
+    """
+    count = chosen.shape[0]
+    triangle = np.zeros((count, count))
+    for a in range(count):
+        for b in range(a + 1):
+            triangle[a, b] = basis[b, chosen[a]]
+    return triangle
+
+
+@njit(cache=True, nogil=True)
+def _diagonal_and_pull(starts, rows, values, scale, target):
     """Return (columns,) Σ (scale A)² and Σ scale A target of each atom."""
+    columns = starts.shape[0] - 1
     diagonal = np.zeros(columns)
     pull = np.zeros(columns)
     for j in range(columns):
@@ -146,6 +175,8 @@ def _normal_column(pointer, index, value, scale, starts, rows, values, atom, col
     for k in range(starts[atom], starts[atom + 1]):
         i = rows[k]
         a = values[k] * scale[i] * scale[i]
+        if a == 0.0:
+            continue
         for m in range(pointer[i], pointer[i + 1]):
             column[index[m]] += a * value[m]
 

@@ -1,9 +1,13 @@
 """Gauss-Newton on a leaf: its radii and their slopes for the chosen centres, and the normal equations (DESIGN §3)."""
 
+import math
+
 import numpy as np
 from numba import njit
 
 from hhsr.kernels.sphere_rbf import wendland_gaussian
+from hhsr.kernels.triangle_build import STACK
+from hhsr.kernels.triangles import nearest_triangle
 
 
 @njit(cache=True, nogil=True)
@@ -38,6 +42,81 @@ def field_values(pointer, index, value, weights):
         for m in range(pointer[i], pointer[i + 1]):
             out[i] += weights[index[m]] * value[m]
     return out
+
+
+@njit(cache=True, nogil=True)
+def ellipsoid_radii(half_axes, directions):
+    """Return (n,) radii q of the ellipsoid of six half axes, a₊ a₋ b₊ b₋ c₊ c₋, in (n, 3) unit directions."""
+    out = np.empty(directions.shape[0])
+    for i in range(directions.shape[0]):
+        total = 0.0
+        for k in range(3):
+            u = directions[i, k]
+            x = u / half_axes[2 * k + (0 if u >= 0.0 else 1)]
+            total += x * x
+        out[i] = 1.0 / math.sqrt(total)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def axis_slopes(half_axes, directions, radii):
+    """Return (n, 6) dq / d log a of an ellipsoid's radii q in (n, 3) unit directions."""
+    out = np.zeros((directions.shape[0], 6))
+    for i in range(directions.shape[0]):
+        cubed = radii[i] * radii[i] * radii[i]
+        for k in range(3):
+            u = directions[i, k]
+            at = 2 * k + (0 if u >= 0.0 else 1)
+            x = u / half_axes[at]
+            out[i, at] = cubed * x * x
+    return out
+
+
+@njit(cache=True, nogil=True)
+def own_misses(
+    boxes, links, corners, normals, offsets, centre, directions, radius, grazing, least, area, miss, slope, share
+):
+    """Fill in the signed distances of a leaf's own points, within its region, to closed triangles.
+
+    boxes, links, corners: see `hhsr.kernels.triangles`. normals, offsets: (k, 3), (k,) the region's planes.
+    directions, radius: (n, 3), (n,) of the points, about the centre; neighbours in order save half of the time.
+    grazing: least |slope|. least: nearer than this, the triangle's normal says where outwards is. area: what a point
+    stands for at radius 1, in samples. miss, slope, share: (n,) see `hhsr.fitting.refine.Misses`; points outside the
+    region are left as they are.
+    """
+    stack, keys = np.empty(STACK, np.int64), np.empty(STACK)
+    hint = -1
+    p, near, normal = np.empty(3), np.empty(3), np.empty(3)
+    for i in range(radius.shape[0]):
+        for k in range(3):
+            p[k] = centre[k] + radius[i] * directions[i, k]
+        held = True
+        for j in range(offsets.shape[0]):
+            if normals[j, 0] * p[0] + normals[j, 1] * p[1] + normals[j, 2] * p[2] < offsets[j]:
+                held = False
+        if not held:
+            continue
+        hint, d2, v, w = nearest_triangle(boxes, links, corners, p[0], p[1], p[2], np.inf, hint, stack, keys)
+        a, b, c = corners[hint, 0], corners[hint, 1], corners[hint, 2]
+        for k in range(3):
+            i1, i2 = (k + 1) % 3, (k + 2) % 3
+            near[k] = a[k] + v * (b[k] - a[k]) + w * (c[k] - a[k])
+            normal[k] = (b[i1] - a[i1]) * (c[i2] - a[i2]) - (b[i2] - a[i2]) * (c[i1] - a[i1])
+        long = max(math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2), 1e-300)
+        height = 0.0
+        for k in range(3):
+            height += (p[k] - near[k]) * normal[k]
+        side = -1.0 if height < 0.0 else 1.0
+        distance = math.sqrt(d2)
+        steep = 0.0
+        for k in range(3):
+            outward = side * (p[k] - near[k]) / distance if distance > least else normal[k] / long
+            steep += outward * directions[i, k]
+        if abs(steep) < grazing:
+            steep = math.copysign(grazing, steep)
+        miss[i] = side * distance
+        slope[i] = steep
+        share[i] = area * radius[i] ** 2 / abs(steep)
 
 
 @njit(cache=True, nogil=True)

@@ -69,32 +69,30 @@ def atoms_of_cells(centres, starts, extents, edge):
 
 @njit(cache=True, nogil=True)
 def dictionary_rows(directions, centres, inverse_extents, edge, cell_pointer, cell_atoms):
-    """Return (n + 1,) row starts, (nnz,) atoms, (nnz,) λ: which atoms of the dictionary see which unit direction.
+    """Return (n + 1,) row starts, (nnz,) atoms, (nnz,) λ in single precision: which atoms see which unit direction.
 
     inverse_extents: (M,) 1 / (1 − cos σ). edge, cell_pointer, cell_atoms: see `atoms_of_cells`.
     """
     n = directions.shape[0]
+    room = 0
+    cells = np.empty(n, np.int64)
+    for i in range(n):
+        cells[i] = _cell_of(directions[i, 0], directions[i, 1], directions[i, 2], edge)
+        room += cell_pointer[cells[i] + 1] - cell_pointer[cells[i]]
     pointer = np.zeros(n + 1, np.int64)
-    index = np.empty(0, np.int32)
-    value = np.empty(0)
-    for write in range(2):
-        if write == 1:
-            index = np.empty(pointer[n], np.int32)
-            value = np.empty(pointer[n])
-        at = 0
-        for i in range(n):
-            x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
-            cell = _cell_of(x, y, z, edge)
-            for k in range(cell_pointer[cell], cell_pointer[cell + 1]):
-                j = cell_atoms[k]
-                h = (1.0 - (x * centres[j, 0] + y * centres[j, 1] + z * centres[j, 2])) * inverse_extents[j]
-                if h < 1.0:
-                    if write == 1:
-                        index[at] = j
-                        value[at] = wendland_gaussian(h)
-                    at += 1
-            pointer[i + 1] = at
-    return pointer, index, value
+    index, value = np.empty(room, np.int32), np.empty(room, np.float32)
+    at = 0
+    for i in range(n):
+        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+        for k in range(cell_pointer[cells[i]], cell_pointer[cells[i] + 1]):
+            j = cell_atoms[k]
+            h = (1.0 - (x * centres[j, 0] + y * centres[j, 1] + z * centres[j, 2])) * inverse_extents[j]
+            if h < 1.0:
+                index[at] = j
+                value[at] = wendland_gaussian(h)
+                at += 1
+        pointer[i + 1] = at
+    return pointer, index[:at], value[:at]
 
 
 @njit(cache=True, nogil=True)
@@ -107,7 +105,7 @@ def transposed(pointer, index, value, columns):
         starts[j + 1] += starts[j]
     fill = starts[:-1].copy()
     rows = np.empty(index.shape[0], np.int32)
-    values = np.empty(index.shape[0])
+    values = np.empty(index.shape[0], value.dtype)
     for i in range(pointer.shape[0] - 1):
         for k in range(pointer[i], pointer[i + 1]):
             j = index[k]
@@ -122,57 +120,86 @@ def back_substituted(triangle, right, count):
     """Return (count,) w of L[:count, :count]ᵀ w = right[:count]."""
     w = right[:count].copy()
     for a in range(count - 1, -1, -1):
-        for b in range(a + 1, count):
-            w[a] -= triangle[b, a] * w[b]
         w[a] /= triangle[a, a]
+        for b in range(a):
+            w[b] -= triangle[a, b] * w[a]
     return w
 
 
-@njit(cache=True, nogil=True)
-def drop_costs(triangle, right):
-    """Return (k,) by how much the sum of squares rises when one chosen atom is dropped and the others are fitted again.
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def upper_factor(matrix):
+    """Return U, zero below its diagonal, with UᵀU = a symmetric positive definite matrix (n, n).
 
-    w_j² / (G⁻¹)_jj for the normal matrix G = L Lᵀ.
+    By rows of U, four earlier rows at a time: no sum runs along a row, so the processor takes several columns at once,
+    always in the same order of sums.
     """
-    k = right.shape[0]
-    weights = back_substituted(triangle, right, k)
-    inverse = np.zeros((k, k))
-    for a in range(k):
-        inverse[a, a] = 1.0 / triangle[a, a]
-        for b in range(a):
-            total = 0.0
-            for c in range(b, a):
-                total += triangle[a, c] * inverse[c, b]
-            inverse[a, b] = -total / triangle[a, a]
-    costs = np.empty(k)
-    for b in range(k):
-        total = 0.0
-        for a in range(b, k):
-            total += inverse[a, b] * inverse[a, b]
-        costs[b] = weights[b] * weights[b] / total
-    return costs
+    n = matrix.shape[0]
+    upper = np.zeros((n, n))
+    for a in range(n):
+        row = upper[a]
+        row[a:] = matrix[a, a:]
+        for k in range(0, a - 3, 4):
+            first, second, third, fourth = upper[k], upper[k + 1], upper[k + 2], upper[k + 3]
+            p, q, r, s = first[a], second[a], third[a], fourth[a]
+            for b in range(a, n):
+                row[b] -= p * first[b] + q * second[b] + r * third[b] + s * fourth[b]
+        for k in range(a - a % 4, a):
+            line = upper[k]
+            factor = line[a]
+            for b in range(a, n):
+                row[b] -= factor * line[b]
+        pivot = math.sqrt(max(row[a], 1e-300))
+        row[a] = pivot
+        for b in range(a + 1, n):
+            row[b] /= pivot
+    return upper
+
+
+@njit(cache=True, nogil=True)
+def solve_upper(upper, right):
+    """Return x of UᵀU x = right."""
+    n = right.shape[0]
+    x = right.copy()
+    for a in range(n):
+        x[a] /= upper[a, a]
+        for b in range(a + 1, n):
+            x[b] -= upper[a, b] * x[a]
+    for a in range(n - 1, -1, -1):
+        total = x[a]
+        for k in range(a + 1, n):
+            total -= upper[a, k] * x[k]
+        x[a] = total / upper[a, a]
+    return x
 
 
 @njit(cache=True, nogil=True)
 def solve_normal(matrix, right):
     """Return the solution of a symmetric positive definite system by Cholesky, always in the same order of sums."""
-    n = right.shape[0]
-    lower = matrix.copy()
-    x = right.copy()
-    for a in range(n):
+    return solve_upper(upper_factor(matrix), right)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def drop_costs(matrix, right):
+    """Return (k,) by how much a least sum of squares rises when one unknown is dropped and the others are fitted again.
+
+    matrix (k, k), right (k,): its normal equations. The rise is w_j² / (G⁻¹)_jj.
+    """
+    k = right.shape[0]
+    upper = upper_factor(matrix)
+    weights = solve_upper(upper, right)
+    inverse = np.zeros((k, k))  # of Uᵀ, row by row
+    for a in range(k):
+        row = inverse[a]
+        for c in range(a):
+            factor = upper[c, a]
+            line = inverse[c]
+            for b in range(c + 1):
+                row[b] -= factor * line[b]
+        for b in range(a):
+            row[b] /= upper[a, a]
+        row[a] = 1.0 / upper[a, a]
+    total = np.zeros(k)
+    for a in range(k):
         for b in range(a + 1):
-            total = lower[a, b]
-            for k in range(b):
-                total -= lower[a, k] * lower[b, k]
-            if a == b:
-                lower[a, a] = math.sqrt(max(total, 1e-300))
-            else:
-                lower[a, b] = total / lower[b, b]
-        for k in range(a):
-            x[a] -= lower[a, k] * x[k]
-        x[a] /= lower[a, a]
-    for a in range(n - 1, -1, -1):
-        for k in range(a + 1, n):
-            x[a] -= lower[k, a] * x[k]
-        x[a] /= lower[a, a]
-    return x
+            total[b] += inverse[a, b] * inverse[a, b]
+    return weights * weights / total

@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 import trimesh
 
+from hhsr.fitting.aim import aim_of
 from hhsr.fitting.closing import closed, with_section
 from hhsr.fitting.lookahead import Layout, Parting
 from hhsr.fitting.normalise import normalise, on_grid, scaled
 from hhsr.fitting.planes import settled
-from hhsr.fitting.refine import radii_of
+from hhsr.fitting.refine import improved, radii_of, view_of, weights_of
+from hhsr.fitting.samples import side_by_side, turned_fibonacci
 from hhsr.fitting.scale_field import NONE, fit_ellipsoid, grid_for, leaf_of, select_centres
 from hhsr.fitting.section import Section, section_of
 from hhsr.fitting.solid import Solid, solid_of
-from hhsr.fitting.task import start_rows, task_of
+from hhsr.fitting.task import first_rows, start_rows, task_of
+from hhsr.kernels.refinement import ellipsoid_radii
 from hhsr.model import Cut, ModelLeaf, ScaleField, frozen
 
 
@@ -110,13 +113,56 @@ def test_voids_behind_cuts_are_closed_and_never_made(solid: Solid) -> None:
         axes = fit_ellipsoid(rows)
         field = select_centres(rows, axes, grid_for(300), 40, NONE).field(40)
         leaf = leaf_of(piece.centre, 0.97 * axes, field)
-        before, after = voids(section, leaf), voids(section, closed(solid, task, section, leaf, 1.5)[0])
+        before, after = voids(section, leaf), voids(section, closed(solid, task, section, leaf, aim_of(0.01))[0])
         assert before > 0.0
         assert after <= before
         assert with_section(task, section).behind.shape[0] >= task.behind.shape[0]
         left.append(after / before)
     # Where all of a section is a void, as behind these pieces' first planes, the steps overshoot and are not taken.
     assert min(left) < 0.1
+
+
+def test_rows_for_the_first_centres_are_those_of_bounds_and_holds_together(solid: Solid) -> None:
+    piece = Parting(solid).pieces(1)[0]
+    region = piece.region.halves(np.array([1.0, 0.0, 0.0]), float(piece.centre[0]) + 0.05)[0]
+    task = task_of(solid, region, np.flatnonzero(region.holds(solid.samples.points)), piece.centre, 1)
+    axes = fit_ellipsoid(start_rows(task, solid))
+    rows = first_rows(task, solid, leaf_of(piece.centre, axes, ScaleField.none()))
+    assert np.array_equal(rows.directions, task.directions)
+    told = rows.weights > 0.0
+    assert told.sum() == task.along.shape[0] + task.behind.shape[0]
+    base = ellipsoid_radii(axes, task.behind)
+    short = base < task.bound
+    assert short.any()
+    assert (~short).any()
+    behind = slice(len(rows.radii) - len(task.behind), None)
+    assert np.allclose(rows.radii[behind], np.maximum(base, task.bound))
+    assert (rows.weights[behind][short] > rows.weights[behind][~short].max()).all()
+
+
+def test_a_step_that_does_not_help_is_halved_and_misses_never_grow(solid: Solid) -> None:
+    parting = Parting(solid)
+    assert parting.grown(2)
+    piece = parting.pieces(2)[0]
+    task = task_of(solid, piece.region, piece.members, piece.centre, 1)
+    axes = fit_ellipsoid(start_rows(task, solid))
+    rows = first_rows(task, solid, leaf_of(piece.centre, axes, ScaleField.none()))
+    leaf = leaf_of(piece.centre, 1.3 * axes, select_centres(rows, axes, grid_for(300), 40).field(40))
+    view = view_of(task.directions, leaf)
+    costs = []
+    for steps in range(4):
+        found = improved(solid, task, leaf, view, steps, 1.5)[1]
+        costs.append(float((weights_of(found, solid, 1.5) * found.miss**2).sum()))
+    assert (np.diff(costs) <= 0.0).all()
+    assert costs[3] < 0.5 * costs[0]
+
+
+def test_directions_side_by_side_are_the_same_ones_nearer_to_each_other() -> None:
+    given = turned_fibonacci(2000, 3)
+    ordered = side_by_side(given)
+    assert np.array_equal(given[np.lexsort(given.T)], ordered[np.lexsort(ordered.T)])
+    apart = [float(np.linalg.norm(np.diff(u, axis=0), axis=1).mean()) for u in (given, ordered)]
+    assert apart[1] < 0.1 * apart[0]
 
 
 def test_scaling_scales_every_length() -> None:

@@ -11,6 +11,7 @@ from numba import config
 from hhsr.kernels import field_rows, lookahead, plane_moves, refinement, selection
 from hhsr.kernels import greedy as greedy_kernels
 from hhsr.kernels.sphere_rbf import wendland_gaussian
+from hhsr.kernels.triangle_build import build
 from hhsr.model import CentreGrid
 
 GRID = CentreGrid((12, 40), 2.0)
@@ -52,7 +53,7 @@ def test_three_ways_to_the_same_rows() -> None:
     u = directions(25)
     expected = dense_rows(u, GRID.centres, GRID.extents)
     found = rows_of(u)
-    np.testing.assert_allclose(dense_of(*found, GRID.size), expected, atol=1e-12)
+    np.testing.assert_allclose(dense_of(*found, GRID.size), expected, atol=1e-7)
     found = field_rows.sparse_rows(u, GRID.centres, 1.0 / GRID.extents)
     np.testing.assert_allclose(dense_of(*found, GRID.size), expected, atol=1e-12)
     found = refinement.chosen_rows(u, GRID.centres, GRID.extents)
@@ -70,7 +71,7 @@ def test_rows_grow_beyond_the_first_room() -> None:
     expected = dense_rows(u, wide.centres, wide.extents)
     found = rows_of(u, wide)
     assert len(found[2]) > 64 * len(u)
-    np.testing.assert_allclose(dense_of(*found, 200), expected, atol=1e-12)
+    np.testing.assert_allclose(dense_of(*found, 200), expected, atol=1e-7)
     found = field_rows.sparse_rows(u, wide.centres, 1.0 / wide.extents)
     np.testing.assert_allclose(dense_of(*found, 200), expected, atol=1e-12)
 
@@ -97,6 +98,16 @@ def test_normal_equations_are_those_of_numpy() -> None:
     np.testing.assert_allclose(right, -jacobian.T @ (weight * target), atol=1e-12)
 
 
+@pytest.mark.parametrize("size", [1, 3, 8, 13])
+def test_the_upper_factor_is_cholesky_and_solves(size: int) -> None:
+    rng = np.random.default_rng(size)
+    a = rng.normal(size=(size + 3, size))
+    matrix, right = a.T @ a, rng.normal(size=size)
+    upper = selection.upper_factor(matrix)
+    np.testing.assert_allclose(upper, np.linalg.cholesky(matrix).T, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(selection.solve_upper(upper, right), np.linalg.solve(matrix, right), rtol=1e-8)
+
+
 def test_solving_and_dropping_are_those_of_numpy() -> None:
     rng = np.random.default_rng(3)
     a = rng.normal(size=(12, 5))
@@ -113,7 +124,33 @@ def test_solving_and_dropping_are_those_of_numpy() -> None:
     for k in range(5):
         keep = np.delete(np.arange(5), k)
         costs.append(-right[keep] @ np.linalg.solve(matrix[np.ix_(keep, keep)], right[keep]) - full)
-    np.testing.assert_allclose(selection.drop_costs(triangle, y), costs, rtol=1e-7)
+    np.testing.assert_allclose(selection.drop_costs(matrix, right), costs, rtol=1e-7)
+
+
+def selected(
+    pointer: np.ndarray,
+    index: np.ndarray,
+    value: np.ndarray,
+    scale: np.ndarray,
+    target: np.ndarray,
+    columns: int,
+    count: int,
+    ridge: np.ndarray,
+    held: np.ndarray,
+    pauses: tuple[int, ...] = (),
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return atoms, gains, triangle and right side of a selection, made in one go or with pauses."""
+    seen = selection.transposed(pointer, index, value, columns)
+    diagonal, full, pull, usable = greedy_kernels.begin(*seen, scale, target, ridge)
+    rest, done = full.copy(), 0
+    basis, found = np.zeros((count, columns), np.float32), (np.zeros(count, np.int64), np.zeros(count), np.zeros(count))
+    for until in (*pauses, count):
+        done = greedy_kernels.extend(
+            pointer, index, value, *seen, scale, diagonal, full, usable, rest, pull, basis[:until],
+            *(part[:until] for part in found), done, held,
+        )  # fmt: skip
+    chosen, gains, right = (part[:done] for part in found)
+    return chosen, gains, greedy_kernels.triangle_of(basis, chosen), right
 
 
 def greedy(a: np.ndarray, target: np.ndarray, count: int, ridge: float) -> list[int]:
@@ -139,9 +176,7 @@ def test_selection_is_the_greedy_one_and_its_weights_solve_the_ridge_problem() -
     seen = (a**2).sum(axis=0)
     floor = 1e-2 * seen.sum() / (seen > 0).sum()
     none = np.zeros(0, np.int64)
-    chosen, gains, triangle, right = greedy_kernels.orthogonal_selection(
-        *rows, scale, target, GRID.size, 6, np.full(GRID.size, 1e-2), none
-    )
+    chosen, gains, triangle, right = selected(*rows, scale, target, GRID.size, 6, np.full(GRID.size, 1e-2), none)
     assert chosen.tolist() == greedy(a, target, 6, floor)
     gram = a[:, chosen].T @ a[:, chosen] + floor * np.eye(6)
     np.testing.assert_allclose(triangle @ triangle.T, gram, rtol=1e-5, atol=1e-5)
@@ -149,9 +184,12 @@ def test_selection_is_the_greedy_one_and_its_weights_solve_the_ridge_problem() -
     pull = a[:, chosen].T @ target
     assert gains.sum() == pytest.approx(pull @ np.linalg.solve(gram, pull), rel=1e-4)
     held = np.array([chosen[3], chosen[1]])
-    again = greedy_kernels.orthogonal_selection(*rows, scale, target, GRID.size, 4, 10.0 * RIDGE, held)[0]
+    again = selected(*rows, scale, target, GRID.size, 4, 10.0 * RIDGE, held)[0]
     assert again[:2].tolist() == held.tolist()
     assert len(set(again.tolist())) == 4
+    paused = selected(*rows, scale, target, GRID.size, 6, np.full(GRID.size, 1e-2), none, pauses=(1, 3))
+    assert paused[0].tolist() == chosen.tolist()
+    np.testing.assert_allclose(paused[1], gains, rtol=1e-4)
 
 
 def test_blocks_choose_what_one_by_one_would() -> None:
@@ -165,9 +203,7 @@ def test_blocks_choose_what_one_by_one_would() -> None:
     ridge = np.full(grid.size, 1e-5)
     count = 20 if config.DISABLE_JIT else 80
     none = np.zeros(0, np.int64)
-    chosen, gains, triangle, right = greedy_kernels.orthogonal_selection(
-        *rows, np.ones(900), target, grid.size, count, ridge, none
-    )
+    chosen, gains, triangle, right = selected(*rows, np.ones(900), target, grid.size, count, ridge, none)
     floor = 1e-5 * (a**2).sum(axis=0)[(a**2).sum(axis=0) > 0].mean()
     slow: list[int] = []
     lifted = np.vstack([a, math.sqrt(floor) * np.eye(grid.size)])
@@ -192,14 +228,10 @@ def test_blocks_choose_what_one_by_one_would() -> None:
 def test_selection_ends_where_nothing_is_left_to_gain() -> None:
     rows = rows_of(directions(5))
     none = np.zeros(0, np.int64)
-    nothing = greedy_kernels.orthogonal_selection(
-        *rows, np.ones(5), np.zeros(5), GRID.size, 10, np.full(GRID.size, 1e-3), none
-    )
+    nothing = selected(*rows, np.ones(5), np.zeros(5), GRID.size, 10, np.full(GRID.size, 1e-3), none)
     assert [len(part) for part in nothing] == [0, 0, 0, 0]
     one = (np.array([0, 1, 2]), np.array([0, 0], np.int32), np.array([1.0, 2.0]))  # two rows see one atom of three
-    chosen, gains, _, right = greedy_kernels.orthogonal_selection(
-        *one, np.ones(2), np.array([1.0, 2.0]), 3, 3, np.zeros(3), none
-    )
+    chosen, gains, _, right = selected(*one, np.ones(2), np.array([1.0, 2.0]), 3, 3, np.zeros(3), none)
     assert chosen.tolist() == [0]
     assert gains[0] == pytest.approx(5.0)
     assert right[0] == pytest.approx(math.sqrt(5.0))
@@ -276,3 +308,44 @@ def test_gaussian_of_the_rows_is_the_leaf_one() -> None:
     _, _, value = refinement.chosen_rows(u, u[3:], np.array([2.5]))
     expected = [wendland_gaussian((1 - v @ u[3]) / 2.5) for v in u if 1 - v @ u[3] < 2.5]
     np.testing.assert_allclose(value, expected, rtol=1e-12)
+
+
+def test_an_ellipsoid_and_its_slopes_are_those_of_differences() -> None:
+    u, axes = directions(30), np.array([3.0, 1.5, 2.0, 2.5, 1.0, 4.0])
+    radii = refinement.ellipsoid_radii(axes, u)
+    seen = np.where(u >= 0.0, axes[0::2], axes[1::2])
+    np.testing.assert_allclose(((radii[:, None] * u / seen) ** 2).sum(axis=1), 1.0, rtol=1e-12)
+    slopes = refinement.axis_slopes(axes, u, radii)
+    for k in range(6):
+        longer = axes * np.exp(1e-6 * (np.arange(6) == k))
+        rise = (refinement.ellipsoid_radii(longer, u) - radii) / 1e-6
+        np.testing.assert_allclose(slopes[:, k], rise, atol=1e-4)
+
+
+def test_own_misses_are_signed_distances_and_their_slopes() -> None:
+    corners = np.array(
+        [[-1.0, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]
+    )
+    faces = np.array([
+        [0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4],
+        [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7],
+    ])  # fmt: skip
+    boxes, links, triangles, _ = build(corners, faces)
+    u = np.array([[1.0, 0, 0], [0.8, 0.6, 0], [0, 0, 1], [0, -1.0, 0], [0.6, 0, 0.8]])
+    radius = np.array([0.7, 1.1, 1.5, 0.5, 1.25])
+    miss, slope, share = np.full(5, 9.0), np.full(5, 9.0), np.full(5, 9.0)
+    normals, offsets = np.array([[0.0, 1.0, 0.0]]), np.array([-0.25])  # y ≥ −0.25: the fourth point lies outside
+    refinement.own_misses(
+        boxes, links, triangles, normals, offsets, np.zeros(3), u, radius, 0.2, 1e-9, 2.0, miss, slope, share
+    )
+    np.testing.assert_allclose(miss, [-0.3, -0.12, 0.5, 9.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(slope, [1.0, 0.8, 1.0, 9.0, 0.8], atol=1e-12)
+    np.testing.assert_allclose(share, [2 * 0.49, 2 * 1.21 / 0.8, 4.5, 9.0, 2 * 1.5625 / 0.8], rtol=1e-12)
+    grazing = np.array([[0.0, 1.0, 0.0]])
+    one = np.array([0.9]), np.zeros(1), np.zeros(1), np.zeros(1)
+    refinement.own_misses(
+        boxes, links, triangles, np.zeros((0, 3)), np.zeros(0), np.array([0.95, 0.0, 0.0]), grazing, *one[:1],
+        0.2, 1e-9, 1.0, *one[1:],
+    )  # fmt: skip
+    assert one[1][0] == pytest.approx(-0.05)
+    assert abs(one[2][0]) == pytest.approx(0.2)  # the nearest wall runs along the ray: the slope is held at 0.2
