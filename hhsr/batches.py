@@ -44,3 +44,18 @@ def neighbours_first(points: FloatArray) -> NDArray[np.int64]:
     for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
         cell = (cell | (cell << shift)) & mask
     return np.argsort(cell[:, 0] << 2 | cell[:, 1] << 1 | cell[:, 2], kind="stable")
+
+
+def among_neighbours(
+    points: FloatArray, outputs: tuple[FloatArray, ...], smallest: int, work: Callable[..., int]
+) -> int:
+    """Return the sum of work(points, *outputs) over parts of points (n, 3), neighbours together.
+
+    outputs: (n, …) each, filled in the order of the points.
+    """
+    order = neighbours_first(points)
+    near, found = points[order], [np.empty_like(out) for out in outputs]
+    total = int(sum(in_parts(len(near), smallest, lambda i, j: work(near[i:j], *(out[i:j] for out in found)))))
+    for out, values in zip(outputs, found, strict=True):
+        out[order] = values
+    return total

@@ -26,7 +26,7 @@ from hhsr.answers import (
     one_row,
     scalar,
 )
-from hhsr.batches import in_parts, neighbours_first
+from hhsr.batches import among_neighbours, in_parts
 from hhsr.check import as_float, as_points, as_rigid, require_finite
 from hhsr.compiled import Compiled, compile_tree
 from hhsr.errors import FileFormatError, InputError
@@ -201,17 +201,10 @@ class Shape:
         array, mark = as_points(points), marks(on_invalid)
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-6, 1e3)
         flat = array.reshape(-1, 3)
-        blob, order = self._blob, neighbours_first(flat)
-        near, away, at = flat[order], np.empty(len(flat)), np.empty((len(flat), 3))
-        bad = sum(
-            in_parts(
-                len(near),
-                1_000,
-                lambda i, j: distance_kernels.nearest_many(blob, near[i:j], tolerance, away[i:j], at[i:j]),
-            )
+        distance, foot, blob = np.empty(len(flat)), np.empty((len(flat), 3)), self._blob
+        bad = among_neighbours(
+            flat, (distance, foot), 1_000, lambda p, d, f: distance_kernels.nearest_many(blob, p, tolerance, d, f)
         )
-        distance, foot = np.empty_like(away), np.empty_like(at)
-        distance[order], foot[order] = away, at
         if bad and not mark:
             require_finite(array, "points")
         return foot.reshape(array.shape), scalar(distance.reshape(array.shape[:-1]))

@@ -9,11 +9,9 @@ or np.bool_(True).
 
 from __future__ import annotations
 
-from typing import Any
-
 from numba import njit
 
 # `_nrt` is no documented option: with the runtime of references, or not. What a kernel calls inherits it unless said.
-unmanaged: Any = njit(cache=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
-inlined: Any = njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)  # type: ignore[call-overload]
-managed: Any = njit(cache=True, error_model="numpy", _nrt=True)  # type: ignore[call-overload]
+unmanaged = njit(cache=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+inlined = njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)  # type: ignore[call-overload]
+managed = njit(cache=True, error_model="numpy", _nrt=True)  # type: ignore[call-overload]

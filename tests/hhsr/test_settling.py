@@ -1,0 +1,207 @@
+"""What a distance is settled by: second derivatives and how far they change, discs, quadratics, seeds, orders."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from hhsr.batches import neighbours_first
+from hhsr.compiled import compile_tree
+from hhsr.kernels import layout as at
+from hhsr.kernels.cell import direction_of, inverse_radius
+from hhsr.kernels.discs import DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment, lowest_bit
+from hhsr.kernels.facets import _along_curve, facet_cell
+from hhsr.kernels.jet import inverse_radius_bend
+from hhsr.kernels.layout import integers, tables
+from hhsr.kernels.patch import LENGTH2, SEARCH_SIZE, START, VECTOR
+from hhsr.kernels.quadratic import least_over_square, square_is_clear
+from hhsr.kernels.tree import turn_out_of_leaf
+from hhsr.model import CentreGrid, FloatArray, ModelLeaf, ScaleField, Superquadric, Tree, frozen
+from tests.strategies import random_tree
+
+
+def leaf(seed: int, supports: int, weight: float) -> ModelLeaf:
+    """Return a leaf on an ellipsoid with a hundred centres, of one support as fine as a grid of `supports`."""
+    rng = np.random.default_rng(seed)
+    grid = CentreGrid((30, supports), 2.5)
+    index = np.sort(rng.choice(grid.size, min(100, grid.size // 2), replace=False))
+    field = ScaleField(grid, frozen(index, np.int64), frozen(rng.normal(size=len(index)) * weight))
+    return ModelLeaf(frozen([3.0, -2.0, 5.0]), frozen([]), Superquadric(frozen(rng.uniform(40, 90, 6))), field)
+
+
+LEAVES = [leaf(0, 190, 0.05), leaf(1, 1200, 0.2), leaf(2, 8000, 0.4)]
+
+
+def facets(one: ModelLeaf, count: int, rng: np.random.Generator) -> Iterator[tuple[FloatArray, int, tuple[int, ...]]]:
+    """Yield (blob, record, (slot, face, a, b, half)) of facets drawn from a leaf's."""
+    blob = compile_tree(Tree(one, frozen(np.zeros(6)))).blob
+    ints = integers(blob)
+    start, record = ints[at.FACET_CODES], ints[ints[at.OWNER_INTS] + at.OWNER_RECORD]
+    for q in rng.integers(ints[at.FACET_COUNT], size=count):
+        yield blob, record, facet_cell(ints, record, ints[start + q])
+
+
+def surface(blob: FloatArray, record: int, face: int, a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return (n, 3) the surface points in directions (a, b), leaf's frame."""
+    ints = integers(blob)
+    return np.array(
+        [
+            np.array(direction_of(face, x, y)) / inverse_radius(blob, ints, record, face, x, y)
+            for x, y in zip(a, b, strict=True)
+        ]
+    )
+
+
+@pytest.mark.parametrize("one", LEAVES)
+def test_second_derivatives_are_exact_and_change_no_more_than_proven(one: ModelLeaf) -> None:
+    rng = np.random.default_rng(3)
+    seen = 0
+    for blob, record, (slot, face, a, b, half) in facets(one, 60, rng):
+        ints, tab = integers(blob), tables(blob)
+        w, wa, wb, waa, wab, wbb = inverse_radius_bend(blob, ints, record, face, a, b)
+        if w == 0.0:
+            continue
+        step = 1e-5
+        for da, db in ((step, 0.0), (0.0, step), (step, step)):
+            ahead = inverse_radius(blob, ints, record, face, a + da, b + db)
+            behind = inverse_radius(blob, ints, record, face, a - da, b - db)
+            middle = inverse_radius(blob, ints, record, face, a, b)
+            assert middle == pytest.approx(w, rel=1e-12)
+            slope = (ahead - behind) / 2
+            assert slope == pytest.approx(wa * da + wb * db, abs=1e-3 * step * (abs(wa) + abs(wb) + w))
+            bend = ahead - 2 * middle + behind
+            assert bend == pytest.approx(
+                waa * da * da + 2 * wab * da * db + wbb * db * db, abs=2e-2 * step**2 * (abs(waa) + abs(wbb) + 5 * w)
+            )
+        kink, third = float(tab[slot + at.KINK]), float(tab[slot + at.THIRD])
+        if not np.isfinite(third):
+            continue
+        # Not on the cell's border: the half axes, and with them ∂²W, may change there.
+        for u, v in np.concatenate([rng.uniform(-1, 1, (20, 2)), [[1, 1], [-1, 1], [1, 0], [0, -1]]]) * (0.9999 * half):
+            other = inverse_radius_bend(blob, ints, record, face, a + u, b + v)
+            if other[0] == 0.0:
+                continue
+            change = np.linalg.norm([[other[3] - waa, other[4] - wab], [other[4] - wab, other[5] - wbb]], 2)
+            assert change <= kink + third * np.hypot(u, v) + 1e-9 * w
+            seen += 1
+    assert seen > 200
+
+
+@pytest.mark.parametrize("one", LEAVES)
+def test_a_square_is_called_clear_only_where_it_is(one: ModelLeaf) -> None:
+    rng = np.random.default_rng(4)
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * 2), -1).reshape(-1, 2)
+    called = 0
+    for blob, record, (slot, face, a, b, half) in facets(one, 120, rng):
+        ints, tab = integers(blob), tables(blob)
+        jet = inverse_radius_bend(blob, ints, record, face, a, b)
+        kink, third = float(tab[slot + at.KINK]), float(tab[slot + at.THIRD])
+        if jet[0] == 0.0 or not np.isfinite(third):
+            continue
+        points = surface(blob, record, face, a + half * grid[:, 0], b + half * grid[:, 1])
+        middle = points[len(points) // 2]
+        search = np.zeros(SEARCH_SIZE)
+        away = rng.normal(size=3)
+        away *= rng.choice([0.05, 1.0, 20.0, 300.0]) / np.linalg.norm(away)
+        search[START : START + 3] = middle + away
+        if rng.uniform() < 0.5:  # a segment, passing or ending near
+            vector = rng.normal(size=3) * rng.choice([0.1, 5.0, 80.0])
+            search[START : START + 3] -= rng.uniform(-0.2, 1.2) * vector
+            search[VECTOR : VECTOR + 3], search[LENGTH2] = vector, vector @ vector
+        rest = points - search[START : START + 3]
+        t = np.zeros(len(points))
+        if search[LENGTH2] > 0:
+            t = np.clip(rest @ search[VECTOR : VECTOR + 3] / search[LENGTH2], 0, 1)
+        nearest = np.linalg.norm(rest - t[:, None] * search[VECTOR : VECTOR + 3], axis=1).min()
+        for share in (0.3, 0.9, 0.999, 1.0, 1.0 + 1e-9, 1.1):
+            clear, da, db = square_is_clear(search, share * nearest, face, a, b, half, *jet, kink, third)
+            assert max(abs(da), abs(db)) <= half * (1 + 1e-12)
+            assert not (clear and share > 1.0)
+            called += clear
+    assert called > 100  # not by calling nothing clear
+
+
+def test_the_least_of_a_quadratic_over_a_square() -> None:
+    rng = np.random.default_rng(5)
+    x, y = np.meshgrid(*[np.linspace(-1, 1, 201)] * 2)
+    for _ in range(300):
+        c, ca, cb, aa, ab, bb = rng.normal(size=6)
+        half = rng.choice([1e-3, 1.0, 40.0])
+        u, v = half * x, half * y
+        least, a, b = least_over_square(c, ca, cb, aa, ab, bb, half)
+        sampled = (c + ca * u + cb * v + aa * u * u + 2 * ab * u * v + bb * v * v).min()
+        assert least <= sampled + 1e-12 * (1 + half) ** 2
+        assert least == pytest.approx(
+            c + ca * a + cb * b + aa * a * a + 2 * ab * a * b + bb * b * b, abs=1e-9 * (1 + half) ** 2
+        )
+        assert least >= sampled - 0.02 * half * (abs(ca) + abs(cb) + 4 * half * (abs(aa) + abs(ab) + abs(bb)))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_discs_hold_their_facets_at_every_level(seed: int) -> None:
+    """Bounds of discs never exceed the distance to a surface point of a facet below them."""
+    rng = np.random.default_rng(seed)
+    blob = compile_tree(random_tree(seed, depth=2)).blob
+    ints, tab = integers(blob), tables(blob)
+    levels, codes = ints[at.FACET_LEVELS], ints[at.FACET_CODES]
+    first, count = ints[levels + 1 + 2 * ints[levels] : levels + 3 + 2 * ints[levels]]
+    blocks = tab[first : first + count * DISC_SIZE * WIDE].reshape(-1, DISC_SIZE, WIDE)
+    bounds = np.empty(WIDE, dtype=np.float32)
+    for q in rng.integers(ints[at.FACET_COUNT], size=60):
+        code = ints[codes + q]
+        owner = ints[at.OWNER_INTS] + at.OWNER_INT_SIZE * (code >> 24)
+        record = ints[owner + at.OWNER_RECORD]
+        _, face, a, b, half = facet_cell(ints, record, code)
+        s = surface(blob, record, face, a + half * rng.uniform(-1, 1, 6), b + half * rng.uniform(-1, 1, 6))
+        planes = blob[ints[owner + at.OWNER_PLANE_FLOATS] :][: 4 * ints[owner + at.OWNER_PLANES]].reshape(-1, 4)
+        s = s[(s @ planes[:, :3].T <= planes[:, 3]).all(axis=1)]
+        frame = ints[record + at.FRAME]
+        s = np.array([turn_out_of_leaf(blob, frame, *p) for p in s]).reshape(-1, 3) + blob[frame : frame + 3]
+        for p in s:
+            query = p + rng.normal(size=3) * rng.choice([0.01, 3.0, 60.0, 1e6])
+            vector = rng.normal(size=3) * rng.choice([1.0, 100.0])
+            loose = LOOSE * (2 * np.abs(query).max() + np.abs(vector).max() + 2 * np.abs(p).max() + 200.0)
+            place = q
+            for level in range(ints[levels]):
+                block = ints[levels + 1 + 2 * level] + place // WIDE
+                mask = bound_to_point(blocks, block, *query, loose, 1e30, bounds)
+                true = np.linalg.norm(p - query)
+                assert bounds[place % WIDE] <= true * true * (1 + 1e-6)
+                assert mask >> (place % WIDE) & 1
+                t = np.clip((p - query) @ vector / (vector @ vector), 0, 1)
+                true = np.linalg.norm(p - query - t * vector)
+                bound_to_segment(blocks, block, *query, *vector, loose, 1e30, bounds)
+                assert bounds[place % WIDE] <= true * true * (1 + 1e-6)
+                place //= WIDE
+
+
+def test_the_lowest_bit_of_a_mask() -> None:
+    for mask in [1, 2, 3, 0x8000, 0xFFFF, 0xFFFFFFFF, *np.random.default_rng(0).integers(1, 2**32, 50)]:
+        found, rest = [], np.uint32(mask)
+        while rest != 0:
+            place, rest = lowest_bit(np.uint32(rest))
+            found.append(int(place))
+        assert found == [k for k in range(32) if int(mask) >> k & 1]
+
+
+def test_the_curve_is_unbroken() -> None:
+    places = {_along_curve(i, j, 16): (i, j) for i in range(16) for j in range(16)}
+    assert sorted(places) == list(range(256))
+    assert all(np.abs(np.subtract(places[k], places[k + 1])).sum() == 1 for k in range(255))
+
+
+def test_neighbours_first_is_an_order_of_all_points() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-100, 100, (5000, 3))
+    order = neighbours_first(points)
+    assert sorted(order) == list(range(5000))
+    steps = np.linalg.norm(np.diff(points[order], axis=0), axis=1)
+    assert steps.mean() < 0.25 * np.linalg.norm(np.diff(points, axis=0), axis=1).mean()
+    points[7] = np.nan
+    points[9] = [np.inf, 0, -np.inf]
+    points[11] = 1e300
+    assert sorted(neighbours_first(points)) == list(range(5000))
+    assert neighbours_first(np.empty((0, 3))).shape == (0,)
+    assert list(neighbours_first(np.ones((3, 3)))) == [0, 1, 2]
