@@ -24,7 +24,7 @@ from hhsr.model import Cut, FloatArray, ModelLeaf, RetainedPart, rotation_matrix
 
 VOXELS_TOTAL = 340_000  # some 5 bytes each, surfels and all
 SEEDS_TOTAL = 60_000  # four bytes each
-EMPTY = 1e15  # mm: where a block has no disc
+EMPTY = 1e9  # mm: where a block has no disc
 
 BandTables = tuple[tuple[tuple[FloatArray, FloatArray], ...], ...]
 

@@ -68,6 +68,7 @@ def fill_discs(facets, sizes, blocks):
 
 # The loops below run in lanes, in float32 throughout: `loose` (mm) is more than that rounds at the coordinates at hand.
 LOOSE = 2e-6
+MOST = 1e38  # a squared distance that float32 still holds
 _SHORT, _LONG, _NONE, _ALL = np.float32(1.0 - 1e-6), np.float32(1.0 + 1e-6), np.float32(0.0), np.float32(1.0)
 
 
@@ -77,7 +78,7 @@ def bound_to_point(blocks, i, x, y, z, loose, most, bounds):
 
     Returns a mask: bit c is set where bound c is no more than `most`. blocks: (…, DISC_SIZE, 16) float32.
     """
-    k, mask, limit = np.uint64(i), np.uint32(0), np.float32(most) * _LONG
+    k, mask, limit = np.uint64(i), np.uint32(0), np.float32(min(most, MOST)) * _LONG
     px, py, pz, e = np.float32(x), np.float32(y), np.float32(z), np.float32(loose)
     for c in range(bounds.shape[0]):
         rx, ry, rz = px - blocks[k, 0, c], py - blocks[k, 1, c], pz - blocks[k, 2, c]
@@ -94,7 +95,7 @@ def bound_to_point(blocks, i, x, y, z, loose, most, bounds):
 @unmanaged
 def bound_to_segment(blocks, i, x, y, z, dx, dy, dz, loose, most, bounds):
     """Do as `bound_to_point` for p + t·d: by the slab about a disc's plane, and by the ball about the disc."""
-    k, mask, limit = np.uint64(i), np.uint32(0), np.float32(most) * _LONG
+    k, mask, limit = np.uint64(i), np.uint32(0), np.float32(min(most, MOST)) * _LONG
     px, py, pz, e = np.float32(x), np.float32(y), np.float32(z), np.float32(loose)
     vx, vy, vz = np.float32(dx), np.float32(dy), np.float32(dz)
     over = np.float32(1.0 / (dx * dx + dy * dy + dz * dz))
@@ -116,14 +117,14 @@ def bound_to_segment(blocks, i, x, y, z, dx, dy, dz, loose, most, bounds):
 
 
 # The place of a lone bit: the top five bits of its product with de Bruijn's number tell all 32 apart.
-_DE_BRUIJN = np.uint32(0x077CB531)
+_DE_BRUIJN = 0x077CB531
 _PLACES = np.empty(32, dtype=np.int64)
 for _k in range(32):
-    _PLACES[((0x077CB531 << _k) & 0xFFFFFFFF) >> 27] = _k
+    _PLACES[((_DE_BRUIJN << _k) & 0xFFFFFFFF) >> 27] = _k
 
 
 @unmanaged
 def lowest_bit(mask):
     """Return (c, rest): the place of the lowest bit of a mask that is not 0, and the mask without it."""
-    bit = mask & (~mask + np.uint32(1))
-    return _PLACES[np.uint32(np.uint32(bit * _DE_BRUIJN) >> np.uint32(27))], mask ^ bit
+    bit = np.int64(mask) & -np.int64(mask)
+    return _PLACES[(bit * _DE_BRUIJN & 0xFFFFFFFF) >> 27], np.int64(mask) ^ bit

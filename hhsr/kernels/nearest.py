@@ -48,6 +48,7 @@ from hhsr.kernels.seeds import seed_at
 from hhsr.kernels.tree import into_leaf, turn_into_leaf, turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
 
+VAST = 1e9  # mm
 PATIENCE = 16  # facets that may wait
 SAMPLES = 4  # points of a segment that ask for a seed
 
@@ -146,16 +147,20 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
     limit = search[BEST] - search[TOLERANCE]
     depth, waiting = 1, 0
     nodes[0], keys[0] = (ints[levels] - 1) << 40, 0.0
+    mask = np.int64(0)
     while depth > 0:
         depth -= 1
         if limit < 0.0 or keys[depth] > limit * limit:
             continue
         level, i = nodes[depth] >> 40, nodes[depth] & 0xFFFFFFFFFF
         start, size = ints[levels + 1 + 2 * level], ints[levels + 2 + 2 * level]
-        if moving:
-            mask = bound_to_segment(blocks, start + i, x, y, z, dx, dy, dz, loose, limit * limit, bounds)
+        if not reach < VAST:  # beyond what float32 holds: no disc is ruled out
+            bounds[:] = np.float32(0.0)
+            mask = np.int64((1 << WIDE) - 1)
+        elif moving:
+            mask = np.int64(bound_to_segment(blocks, start + i, x, y, z, dx, dy, dz, loose, limit * limit, bounds))
         else:
-            mask = bound_to_point(blocks, start + i, x, y, z, loose, limit * limit, bounds)
+            mask = np.int64(bound_to_point(blocks, start + i, x, y, z, loose, limit * limit, bounds))
         base = depth
         while mask != 0:
             c, mask = lowest_bit(mask)

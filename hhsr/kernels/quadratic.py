@@ -22,6 +22,8 @@ from hhsr.kernels.maps import outside_region
 from hhsr.kernels.patch import BEST, FINEST, LENGTH2, NODE_ROOM, START, TOLERANCE, VECTOR, distance_to, offer
 from hhsr.kernels.unmanaged import unmanaged
 
+WIDEST = 1e60  # mm: no surface lies beyond, and its fourth power is still a number
+
 
 @unmanaged
 def _along_edge(c, linear, square, half):
@@ -133,7 +135,7 @@ def settle_square(blob, ints, tab, leaf, planes, count, search, face, o, a, b, h
             return False
         clear = False
         for turn in range(2):
-            radius = search[BEST] - search[TOLERANCE]
+            radius = min(search[BEST] - search[TOLERANCE], WIDEST)
             if radius <= 0.0:
                 return True
             clear, da, db = square_is_clear(

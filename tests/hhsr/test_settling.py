@@ -19,6 +19,7 @@ from hhsr.kernels.patch import LENGTH2, SEARCH_SIZE, START, VECTOR
 from hhsr.kernels.quadratic import least_over_square, square_is_clear
 from hhsr.kernels.tree import turn_out_of_leaf
 from hhsr.model import CentreGrid, FloatArray, ModelLeaf, ScaleField, Superquadric, Tree, frozen
+from hhsr.shape import Shape
 from tests.strategies import random_tree
 
 
@@ -205,3 +206,12 @@ def test_neighbours_first_is_an_order_of_all_points() -> None:
     assert sorted(neighbours_first(points)) == list(range(5000))
     assert neighbours_first(np.empty((0, 3))).shape == (0,)
     assert list(neighbours_first(np.ones((3, 3)))) == [0, 1, 2]
+
+
+def test_a_point_beyond_what_single_precision_holds_has_its_distance() -> None:
+    shape = Shape(Tree(LEAVES[0], frozen(np.zeros(6))))
+    for far in (1e8, 1e12, 1e25):
+        point = np.array([far, 0.3 * far, -0.2 * far])
+        nearest, away = shape.closest_point(point)
+        assert away == pytest.approx(np.linalg.norm(point), abs=200.0, rel=1e-12)
+        assert np.abs(nearest).max() < 200
