@@ -330,7 +330,7 @@ def clearance_many(blob, starts, ends, tolerance, value, t, foot):
         if not inside and count == 0:
             set_search(search, px, py, pz, dx, dy, dz, tolerance)
             search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
-            value[i], t[i] = search[BEST] - tolerance, search[BEST_T]
+            value[i], t[i] = search[BEST] - search[TOLERANCE], search[BEST_T]
             foot[i, 0], foot[i, 1], foot[i, 2] = out_of_tree(
                 blob, ints, search[FOOT], search[FOOT + 1], search[FOOT + 2]
             )

@@ -49,6 +49,7 @@ from hhsr.kernels.tree import into_leaf, turn_into_leaf, turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
 
 VAST = 1e9  # mm
+ROUNDING = 1e-9  # of the coordinates
 PATIENCE = 16  # facets that may wait
 SAMPLES = 4  # points of a segment that ask for a seed
 
@@ -136,13 +137,15 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
         _seed_segment(blob, ints, search, local)
     else:
         seed_point(blob, ints, search)
-    local[LENGTH2], local[TOLERANCE] = search[LENGTH2], search[TOLERANCE]
     x, y, z = search[START], search[START + 1], search[START + 2]
     dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
     first = ints[levels + 1 + 2 * ints[levels]]
     blocks = tab[first : first + BLOCK * ints[levels + 2 + 2 * ints[levels]]].reshape(-1, DISC_SIZE, WIDE)
     bounds = keys[LATE + NODE_ROOM :].view(np.float32)
     reach = max(abs(x), abs(y), abs(z)) + max(abs(x + dx), abs(y + dy), abs(z + dz))
+    # From 10 km on the squares of distances round to more than the tolerance.
+    search[TOLERANCE] = max(search[TOLERANCE], ROUNDING * reach)
+    local[LENGTH2], local[TOLERANCE] = search[LENGTH2], search[TOLERANCE]
     loose = LOOSE * (reach + blob[ints[SEED_FRAME] + 4])
     limit = search[BEST] - search[TOLERANCE]
     depth, waiting = 1, 0
