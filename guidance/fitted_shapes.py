@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 from guidance.errors import SceneError
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from hhsr import Shape
 
 RECIPE = 3  # raise when the same options should be fitted anew
+_HHSR = "from hhsr.cli import app; app()"  # the command by this interpreter, wherever its script lies
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,35 @@ class ShapeSource:
         """File name of the fitted shape: readable, and another one when source or options change."""
         plain = "".join(c if c.isalnum() or c in "-_" else "_" for c in self.name)
         return f"{plain}-{self.digest()}.hhsr"
+
+
+class _Commands:
+    """Commands `hhsr …` that run in processes of their own; once stopped, none goes on and none begins."""
+
+    def __init__(self) -> None:
+        self._running: set[subprocess.Popen[str]] = set()
+        self._lock = Lock()
+        self._stopped = False
+
+    def run(self, *words: str) -> tuple[int, list[str]]:
+        """Run a command by this interpreter; return its exit code and the lines of what it said."""
+        command = [sys.executable, "-c", _HHSR, *words]
+        with self._lock:
+            if self._stopped:
+                return 1, ["stopped before it began"]
+            process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+            self._running.add(process)
+        out, errors = process.communicate()
+        with self._lock:
+            self._running.discard(process)
+        return process.returncode, (errors.strip() or out.strip()).splitlines()
+
+    def stop(self) -> None:
+        """End what runs: another structure has failed, and nobody will ask for the rest."""
+        with self._lock:
+            self._stopped = True
+            for process in self._running:
+                process.terminate()
 
 
 def fitted_shapes(
@@ -90,15 +121,21 @@ def fitted_shapes(
             ready(source, kept)
     models = sorted((s for s in to_fit if not s.retain), key=_effort, reverse=True)
     apart = models if len(models) > 1 and _cores() > 1 else []
+    commands = _Commands()
     with ThreadPoolExecutor(_cores()) as pool, TemporaryDirectory() as room:
-        fits = {pool.submit(_fit_apart, s, Path(room) / f"{k}.hhsr"): s for k, s in enumerate(apart)}
+        fits = {}
+        for k, source in enumerate(apart):
+            fits[pool.submit(_fit_apart, commands, source, Path(room) / f"{k}.hhsr")] = source
+            if k == 0:  # the first fit compiles what fits need; beside it, what the queries afterwards need
+                pool.submit(commands.run, "warm-up")
         try:
             for source in (s for s in to_fit if s not in apart):
                 ready(source, _keep(source, _fit(source), folder))
             for done in as_completed(fits):
                 ready(fits[done], _keep(fits[done], done.result(), folder))
         except BaseException:
-            pool.shutdown(cancel_futures=True)
+            pool.shutdown(wait=False, cancel_futures=True)
+            commands.stop()
             raise
     return {s.name: shapes[s.name] for s in sources}
 
@@ -151,11 +188,11 @@ def _fit(source: ShapeSource) -> Shape:
         raise SceneError(f"structure {source.name!r} ({source.file.name}): {error}") from error
 
 
-def _fit_apart(source: ShapeSource, out: Path) -> Shape:
+def _fit_apart(commands: _Commands, source: ShapeSource, out: Path) -> Shape:
     """Fit by the command `hhsr fit` in a process of its own: fits hold the interpreter, threads would wait."""
     import hhsr
 
-    command = [sys.executable, "-c", "from hhsr.cli import app; app()", "fit", str(source.file), "-o", str(out)]
+    command = ["fit", str(source.file), "-o", str(out)]
     for flag, value in (
         ("--frame", source.frame),
         ("--unit", source.unit),
@@ -166,9 +203,8 @@ def _fit_apart(source: ShapeSource, out: Path) -> Shape:
             command += [flag, str(value)]
     if source.force:
         command.append("--force")
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        said = (done.stderr.strip() or done.stdout.strip()).splitlines()
+    code, said = commands.run(*command)
+    if code != 0:
         reason = " ".join(line.strip() for line in said[-6:])
         raise SceneError(f"structure {source.name!r} ({source.file.name}): {reason or 'hhsr fit failed'}")
     return hhsr.load(out)

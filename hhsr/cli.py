@@ -1,4 +1,4 @@
-"""The command line: `hhsr fit | info | mesh | verify | query | compare | cohort`.
+"""The command line: `hhsr fit | info | mesh | verify | query | compare | cohort | warm-up`.
 
 Exit codes: 0 done, 1 not verified or some of a cohort failed, 2 bad input.
 """
@@ -196,6 +196,17 @@ def query(
             write_columns(out, {"distance_mm": shape.signed_distance(rows)})
     asked = "segments" if asks_segments else "points"
     Console(highlight=False).print(f"{out}: {question.value} of {len(rows)} {asked}")
+
+
+@app.command("warm-up")
+def warm() -> None:
+    """Compile the queries for this machine and keep them: some minutes once, so that no later program waits."""
+    from hhsr.warm import warm_up
+
+    begun = time.perf_counter()
+    with _busy("compiling the queries"):
+        warm_up()
+    Console(highlight=False).print(f"queries are compiled ({time.perf_counter() - begun:.0f} s)")
 
 
 @app.command()

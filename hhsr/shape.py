@@ -75,12 +75,13 @@ class Shape:
     def warm_up(self) -> Shape:
         """Compile the tree and the kernels now, so that no later query waits; return the shape."""
         at = np.zeros((1, 3))
-        self.contains(at[0])
-        self.contains(at)
-        self.closest_point(at)
-        self.crossings(at, at + 1.0)
-        self.first_crossing(at, at + 1.0)
-        self.clearance(at, at + 1.0)
+        for points in (at, at[0]):  # one point goes by a door of its own
+            self.contains(points)
+            self.field(points)
+            self.closest_point(points)
+            self.crossings(points, points + 1.0)
+            self.first_crossing(points, points + 1.0)
+            self.clearance(points, points + 1.0)
         return self
 
     # -- what it is ---------------------------------------------------------------------------------------------------
