@@ -260,12 +260,11 @@ def best_split(solid: Solid, piece: Piece, power: float, spot: FloatArray | None
 
 
 class _Found(NamedTuple):
-    """A plane, the misfit of both of its sides, and (2, 3) the centres that they are seen from, left and right."""
+    """A plane, and the misfit of both of its sides."""
 
     normal: FloatArray
     offset: float
     misfit: float
-    centres: FloatArray
 
 
 class _View(NamedTuple):
@@ -295,14 +294,14 @@ class _View(NamedTuple):
         """Return the best of the planes at offsets (d, k) along (d, 3) directions; heights: (d, m) of the members."""
         points, normals = self.solid.samples.points, self.solid.samples.normals
         across = np.einsum("di,ci->dc", directions, self.centres)
-        value, which = best_centres(
+        value, _ = best_centres(
             points, normals, self.members, self.gaps, heights, planes, self.centres, across, self.power
         )
         count = (heights[:, None, :] < planes[:, :, None]).sum(axis=2)
         total = value.sum(axis=2)
         total[(count < self.least) | (self.members.size - count < self.least)] = np.inf
         d, k = np.unravel_index(int(total.argmin()), total.shape)
-        return _Found(directions[d], float(planes[d, k]), float(total[d, k]), self.centres[which[d, k]])
+        return _Found(directions[d], float(planes[d, k]), float(total[d, k]))
 
 
 def split_by(solid: Solid, piece: Piece, found: _Found, power: float) -> Split | None:
@@ -313,11 +312,10 @@ def split_by(solid: Solid, piece: Piece, found: _Found, power: float) -> Split |
     below, above = piece.region.halves(normal, offset)
     sides = []
     halves = (below, piece.members[heights < offset]), (above, piece.members[heights >= offset])
-    for (region, members), start in zip(halves, found.centres, strict=True):
+    for region, members in halves:
         if members.size < 8:
             return None
-        centre = best_centre(solid, members, region, power, start)
-        sides.append(Piece(region, members, *centre, piece.depth + 1))
+        sides.append(Piece(region, members, *best_centre(solid, members, region, power), piece.depth + 1))
     return Split(angles, offset, sides[0], sides[1])
 
 
