@@ -21,6 +21,8 @@ COARSE = 2000
 LEAST_SHARE = 0.004
 NEAR_SHARE = 50
 WORST_POWER = 2.0
+# Planes that part the samples alike differ by the order of sums: the first of them is taken, not one by chance.
+ROUNDING = 1e-9
 # A sample that its leaf does not see costs more than its distance behind what is seen: it leaves a sliver beyond a
 # fissure that no leaf tells (liver A of 8 pieces: 0.326 → 0.274 mm).
 HIDDEN_COST = 3.0
@@ -251,7 +253,7 @@ def best_split(solid: Solid, piece: Piece, power: float, spot: FloatArray | None
     for _ in range(3):
         shifts = best.offset + 0.5 * angle * spread * np.linspace(-0.5, 0.5, 5)
         turned = view.best_plane(around(best.normal, angle), shifts, best.normal)
-        if turned.misfit < best.misfit:
+        if turned.misfit < (1.0 - ROUNDING) * best.misfit:
             best = turned
         angle *= 0.5
     if not np.isfinite(best.misfit):
@@ -300,7 +302,8 @@ class _View(NamedTuple):
         count = (heights[:, None, :] < planes[:, :, None]).sum(axis=2)
         total = value.sum(axis=2)
         total[(count < self.least) | (self.members.size - count < self.least)] = np.inf
-        d, k = np.unravel_index(int(total.argmin()), total.shape)
+        first = np.flatnonzero(total.ravel() <= (1.0 + ROUNDING) * total.min())[0]
+        d, k = np.unravel_index(int(first), total.shape)
         return _Found(directions[d], float(planes[d, k]), float(total[d, k]))
 
 
