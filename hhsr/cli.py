@@ -45,6 +45,10 @@ ForceOption = Annotated[bool, typer.Option("--force", help="Take any size as mea
 BudgetOption = Annotated[int | None, typer.Option("--max-parameters", help="Most numbers that may be stored.")]
 MeanOption = Annotated[float | None, typer.Option("--max-mean-error", help="Spend until the mean is below, mm.")]
 MaxOption = Annotated[float | None, typer.Option("--max-error", help="Spend until the maximum is below, mm.")]
+_WEIGHT = "What the largest miss counts beside the mean, 0 … 1; 0.1 lowers maxima and costs some of the mean."
+WeightOption = Annotated[float, typer.Option("--max-error-weight", help=_WEIGHT)]
+_BASES = "What leaves may buy: ellipsoid; turned: axes of their own; any: exponents and knots too (slower queries)."
+BasesOption = Annotated[str, typer.Option("--bases", help=_BASES)]
 RecipeOption = Annotated[str, typer.Option("--recipe", help="default; or paper: the published algorithm as it stands.")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Of everything random; the same seed, the same file.")]
 RowsArgument = Annotated[Path, typer.Argument(metavar="INPUT", help="CSV: x,y,z or x0,y0,z0,x1,y1,z1; or .npy.")]
@@ -68,6 +72,8 @@ def fit(
     max_parameters: BudgetOption = None,
     max_mean_error: MeanOption = None,
     max_error: MaxOption = None,
+    max_error_weight: WeightOption = 0.01,
+    bases: BasesOption = "ellipsoid",
     recipe: RecipeOption = "default",
     seed: SeedOption = 0,
     retain: Annotated[bool, typer.Option("--retain", help="Keep the mesh whole (a vessel tree).")] = False,
@@ -85,6 +91,8 @@ def fit(
             max_parameters=max_parameters,
             max_mean_error_mm=max_mean_error,
             max_error_mm=max_error,
+            max_error_weight=max_error_weight,
+            bases=bases,  # type: ignore[arg-type]  # checked by the record
             recipe=recipe,  # type: ignore[arg-type]  # checked by the record
             seed=seed,
             retain=retain,

@@ -17,11 +17,14 @@ HARDER = 3.0
 MARGIN = 0.3
 
 
-def closed(solid: Solid, task: Task, section: Section, leaf: ModelLeaf, aim: Aim) -> tuple[ModelLeaf, Misses]:
+def closed(
+    solid: Solid, task: Task, section: Section, leaf: ModelLeaf, found: Misses, aim: Aim
+) -> tuple[ModelLeaf, Misses]:
     """Return a leaf, and its misses, after more Gauss-Newton steps in which the bounds that it breaks count ever more.
 
     A bound is broken where the radius is less than the plane's distance and 0.3 of the slack. Of all rounds the one
     with the least score (mean miss and some of the largest) is kept: bounds that cannot be kept spoil the rest.
+    found: what the leaf misses now.
     """
     bounded = with_section(task, section)
     margin = bounded.bound - (1.0 - MARGIN) * bounded.slack
@@ -34,15 +37,14 @@ def closed(solid: Solid, task: Task, section: Section, leaf: ModelLeaf, aim: Aim
         fit = figures(solid, task, section, leaf, found, covering)
         return float(fit.total * task.stride / len(solid.samples.points) + aim.worst * fit.largest)
 
-    best, found = leaf, misses(task, solid, leaf, own)
-    least = score(best, found)
+    best, least, after = leaf, score(leaf, found), found
     for _ in range(ROUNDS):
         broken = radii_of(leaf, bounded.behind, behind) < margin
         if not broken.any():
             break
         bounded = bounded._replace(urgency=np.where(broken, HARDER * bounded.urgency, bounded.urgency))
-        leaf, after = improved(solid, bounded, leaf, view, STEPS, aim.power)
-        after = misses(task, solid, leaf, own, after)
+        leaf, after = improved(solid, bounded, leaf, view, STEPS, aim.power, after)
+        after = misses(task, solid, leaf, own, own=after)
         if score(leaf, after) < least:
             best, found, least = leaf, after, score(leaf, after)
     return best, found

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
-import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -32,9 +30,8 @@ from hhsr.fitting.section import Section, section_of
 from hhsr.fitting.solid import Solid
 from hhsr.fitting.spend import counts_within
 from hhsr.fitting.task import Task, first_rows, hint_rows, start_rows, task_of
+from hhsr.fitting.threads import in_threads
 from hhsr.model import FloatArray, IntArray, ModelLeaf, ScaleField
-
-T = TypeVar("T")
 
 LEAF_NUMBERS = 9
 FINEST = (60, 8_000)
@@ -58,13 +55,15 @@ THOROUGH = Effort(7, 3, 3, 1, bases=True)
 SWAPPED = 0.3
 FURTHER = 1.3
 SEED = 5
+BEHIND = 1.3
 
 
 class Fitted(NamedTuple):
     """Leaves in the order of their pieces, and how they fit.
 
     mean: miss, mm. largests: of each leaf, mm; spots: (leaves, 3) where. unseen: share of the samples that no centre
-    sees. worst: what the largest miss weighs beside the mean.
+    sees. worst: what the largest miss weighs beside the mean. first: mean before any swap, mm. score: what is to be as
+    small as can be: the mean, and a little of the largest; of a fit that was given up, what it would have come to.
     """
 
     leaves: list[ModelLeaf]
@@ -72,17 +71,13 @@ class Fitted(NamedTuple):
     largests: tuple[float, ...]
     spots: FloatArray
     unseen: float
-    worst: float
+    first: float
+    score: float
 
     @property
     def largest(self) -> float:
         """The largest miss, mm."""
         return max(self.largests)
-
-    @property
-    def score(self) -> float:
-        """What is to be as small as can be: the mean miss, and a little of the largest."""
-        return self.mean + self.worst * self.largest
 
 
 class Prepared(NamedTuple):
@@ -115,10 +110,13 @@ class Workshop:
         return Prepared(piece, task, section_of(self.solid, piece.region, piece.centre), bare)
 
 
-def fit_leaves(workshop: Workshop, pieces: Sequence[Piece], budget: int, effort: Effort) -> Fitted:
+def fit_leaves(
+    workshop: Workshop, pieces: Sequence[Piece], budget: int, effort: Effort, rival: Fitted | None = None
+) -> Fitted:
     """Return the leaves of the pieces within a budget of numbers.
 
     effort: a scout tells which parting is worth a thorough fit; without a round of swaps it tells the wrong one.
+    rival: a fit of the same effort; this one is given up where its mean before any swap is 30 % above the rival's.
     """
     free = budget - LEAF_NUMBERS * len(pieces)
     if free < 0:
@@ -137,21 +135,24 @@ def fit_leaves(workshop: Workshop, pieces: Sequence[Piece], budget: int, effort:
         atoms = in_threads(lambda k: atoms_of(grid, local(bare[k], ready[k].task.directions)), len(bare))
         rows = [first_rows(r.task, solid, leaf) for r, leaf in zip(ready, bare, strict=True)]
         leaves = _chosen(atoms, bare, rows, [NONE] * len(bare), [leaf.scale_field.index.size for leaf in leaves], free)
-    best, found = _refined(workshop, ready, leaves, effort.steps)
+    best, found = _refined(workshop, ready, leaves, [None] * len(leaves), effort.steps)
+    if rival is not None and best.first > BEHIND * rival.first:
+        return best._replace(score=rival.score * best.first / rival.first)
+    first = best.first
     for _ in range(effort.swaps):
         tried = _swapped(atoms, tasks, best.leaves, found, free)
-        swapped, after = _refined(workshop, ready, tried, effort.steps)
+        swapped, after = _refined(workshop, ready, tried, found, effort.steps)
         if swapped.mean >= best.mean:
             break
         best, found = swapped, after
-    return _closed(workshop, ready, best)
+    return _closed(workshop, ready, best, found)._replace(first=first)
 
 
-def _closed(workshop: Workshop, ready: list[Prepared], fitted: Fitted) -> Fitted:
+def _closed(workshop: Workshop, ready: list[Prepared], fitted: Fitted, found: list[Misses]) -> Fitted:
     """Return the leaves with their voids behind cuts closed, where that does not cost more than it brings."""
     solid, aim = workshop.solid, workshop.aim
     done = in_threads(
-        lambda k: closed(solid, ready[k].task, ready[k].section, fitted.leaves[k], aim), len(fitted.leaves)
+        lambda k: closed(solid, ready[k].task, ready[k].section, fitted.leaves[k], found[k], aim), len(found)
     )
     return _judged(workshop, ready, done)
 
@@ -195,15 +196,18 @@ def _chosen(
 
 
 def _refined(
-    workshop: Workshop, ready: list[Prepared], leaves: list[ModelLeaf], steps: int
+    workshop: Workshop, ready: list[Prepared], leaves: list[ModelLeaf], before: Sequence[Misses | None], steps: int
 ) -> tuple[Fitted, list[Misses]]:
-    """Return the leaves after some Gauss-Newton steps each, with what they miss."""
+    """Return the leaves after some Gauss-Newton steps each, with what they miss.
+
+    before: of each, what a leaf like it missed.
+    """
 
     solid, aim = workshop.solid, workshop.aim
 
     def work(k: int) -> tuple[ModelLeaf, Misses]:
         view = view_of(ready[k].task.directions, leaves[k])
-        return improved(solid, ready[k].task, leaves[k], view, steps, aim.power)
+        return improved(solid, ready[k].task, leaves[k], view, steps, aim.power, before[k])
 
     done = in_threads(work, len(leaves))
     return _judged(workshop, ready, done), [misses for _, misses in done]
@@ -222,14 +226,9 @@ def _judged(workshop: Workshop, ready: list[Prepared], done: list[tuple[ModelLea
         points[h.argmax()] if h.max(initial=0.0) > f.largest else f.spot
         for f, h, points in zip(found, hidden, unseen, strict=True)
     ]
-    return Fitted(
-        [leaf for leaf, _ in done],
-        (sum(f.total for f in found) + 0.5 * float(gaps.sum())) / count,
-        tuple(largests),
-        np.array(spots),
-        len(gaps) / count,
-        workshop.aim.worst,
-    )
+    mean = (sum(f.total for f in found) + 0.5 * float(gaps.sum())) / count
+    score = mean + workshop.aim.worst * max(largests)
+    return Fitted([leaf for leaf, _ in done], mean, tuple(largests), np.array(spots), len(gaps) / count, mean, score)
 
 
 def _gaps(found: list[Figures], points: FloatArray, spacing: float) -> FloatArray:
@@ -247,12 +246,3 @@ def _gaps(found: list[Figures], points: FloatArray, spacing: float) -> FloatArra
     across = np.sqrt(np.maximum((offset**2).sum(axis=1) - height**2, 0.0))
     gaps: FloatArray = np.hypot(height, np.maximum(across - spacing, 0.0))
     return gaps
-
-
-def in_threads(work: Callable[[int], T], count: int) -> list[T]:
-    """Return [work(0), …], made on as many threads as numba may use; each piece of work is the same on any thread."""
-    workers = min(numba.get_num_threads(), count)
-    if workers <= 1:
-        return [work(k) for k in range(count)]
-    with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(work, range(count)))

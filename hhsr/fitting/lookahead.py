@@ -21,6 +21,8 @@ COARSE = 2000
 LEAST_SHARE = 0.004
 NEAR_SHARE = 50
 WORST_POWER = 2.0
+# Planes that part the samples alike differ by the order of sums: the first of them is taken, not one by chance.
+ROUNDING = 1e-9
 # A sample that its leaf does not see costs more than its distance behind what is seen: it leaves a sliver beyond a
 # fissure that no leaf tells (liver A of 8 pieces: 0.326 → 0.274 mm).
 HIDDEN_COST = 3.0
@@ -245,18 +247,26 @@ def best_split(solid: Solid, piece: Piece, power: float, spot: FloatArray | None
         few = np.concatenate([few, np.repeat(near, max(few.size // (2 * near.size), 1))])
     gaps = hidden_costs(solid, chosen, few, power)
     view = _View(solid, few, gaps, chosen, least * few.size / piece.members.size, power)
-    normal, offset, value = view.best_plane(fibonacci_sphere(2 * DIRECTIONS)[:DIRECTIONS], None, None)
+    best = view.best_plane(fibonacci_sphere(2 * DIRECTIONS)[:DIRECTIONS], None, None)
     spread = float(np.ptp(solid.samples.points[few], axis=0).max())
     angle = 0.25
     for _ in range(3):
-        shifts = offset + 0.5 * angle * spread * np.linspace(-0.5, 0.5, 5)
-        turned = view.best_plane(around(normal, angle), shifts, normal)
-        if turned[2] < value:
-            normal, offset, value = turned
+        shifts = best.offset + 0.5 * angle * spread * np.linspace(-0.5, 0.5, 5)
+        turned = view.best_plane(around(best.normal, angle), shifts, best.normal)
+        if turned.misfit < (1.0 - ROUNDING) * best.misfit:
+            best = turned
         angle *= 0.5
-    if not np.isfinite(value):
+    if not np.isfinite(best.misfit):
         return None
-    return split_by(solid, piece, normal, offset, power)
+    return split_by(solid, piece, best, power)
+
+
+class _Found(NamedTuple):
+    """A plane, and the misfit of both of its sides."""
+
+    normal: FloatArray
+    offset: float
+    misfit: float
 
 
 class _View(NamedTuple):
@@ -269,10 +279,8 @@ class _View(NamedTuple):
     least: float
     power: float
 
-    def best_plane(
-        self, directions: FloatArray, offsets: FloatArray | None, old: FloatArray | None
-    ) -> tuple[FloatArray, float, float]:
-        """Return the plane with the least misfit of both sides: normal, offset, misfit.
+    def best_plane(self, directions: FloatArray, offsets: FloatArray | None, old: FloatArray | None) -> _Found:
+        """Return the plane with the least misfit of both sides.
 
         offsets: along the old normal; a turned plane keeps its height over the members' mean. None: even shares.
         """
@@ -284,9 +292,7 @@ class _View(NamedTuple):
             planes = np.einsum("di,i->d", directions - old, own.mean(axis=0))[:, None] + offsets[None, :]
         return self.best_of(directions, heights, planes)
 
-    def best_of(
-        self, directions: FloatArray, heights: FloatArray, planes: FloatArray
-    ) -> tuple[FloatArray, float, float]:
+    def best_of(self, directions: FloatArray, heights: FloatArray, planes: FloatArray) -> _Found:
         """Return the best of the planes at offsets (d, k) along (d, 3) directions; heights: (d, m) of the members."""
         points, normals = self.solid.samples.points, self.solid.samples.normals
         across = np.einsum("di,ci->dc", directions, self.centres)
@@ -296,18 +302,20 @@ class _View(NamedTuple):
         count = (heights[:, None, :] < planes[:, :, None]).sum(axis=2)
         total = value.sum(axis=2)
         total[(count < self.least) | (self.members.size - count < self.least)] = np.inf
-        d, k = np.unravel_index(int(total.argmin()), total.shape)
-        return directions[d], float(planes[d, k]), float(total[d, k])
+        first = np.flatnonzero(total.ravel() <= (1.0 + ROUNDING) * total.min())[0]
+        d, k = np.unravel_index(int(first), total.shape)
+        return _Found(directions[d], float(planes[d, k]), float(total[d, k]))
 
 
-def split_by(solid: Solid, piece: Piece, normal: FloatArray, offset: float, power: float) -> Split | None:
+def split_by(solid: Solid, piece: Piece, found: _Found, power: float) -> Split | None:
     """Return a piece cut by a plane, with the best centre of either side; None where a side is empty."""
-    angles, offset = rounded_plane(normal, offset, solid.size)
+    angles, offset = rounded_plane(found.normal, found.offset, solid.size)
     normal = normal_of(angles)
     heights = np.einsum("ni,i->n", solid.samples.points[piece.members], normal)
     below, above = piece.region.halves(normal, offset)
     sides = []
-    for region, members in ((below, piece.members[heights < offset]), (above, piece.members[heights >= offset])):
+    halves = (below, piece.members[heights < offset]), (above, piece.members[heights >= offset])
+    for region, members in halves:
         if members.size < 8:
             return None
         sides.append(Piece(region, members, *best_centre(solid, members, region, power), piece.depth + 1))

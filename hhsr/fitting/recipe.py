@@ -12,12 +12,13 @@ from hhsr.fitting.base import ANY, TURNED
 from hhsr.fitting.goals import enough
 from hhsr.fitting.keep import affordable
 from hhsr.fitting.leaves import LEAF_NUMBERS, SCOUT, THOROUGH, Effort, Fitted, Workshop, fit_leaves
-from hhsr.fitting.lookahead import WORST_POWER, Layout, Parting, best_split
+from hhsr.fitting.lookahead import WORST_POWER, Layout, Parting, Split, best_split
 from hhsr.fitting.normalise import on_grid, scaled
 from hhsr.fitting.options import FitOptions
 from hhsr.fitting.planes import settled
 from hhsr.fitting.quantise import quantised
 from hhsr.fitting.solid import solid_of
+from hhsr.fitting.threads import in_threads
 from hhsr.model import FloatArray, IntArray, Node, RetainedPart
 
 KINDS = {"ellipsoid": (), "turned": TURNED, "any": ANY}
@@ -93,7 +94,10 @@ def _spent(workshop: Workshop, budget: int, size_mm: float) -> Node:
         return whole[0]
     scouts = sorted(_scouts(workshop, parting, budget), key=lambda choice: choice.score)
     near = [choice for choice in scouts[:FINALISTS] if choice.score <= NEARLY * scouts[0].score]
-    better = [_pruned(workshop, _mended(workshop, choice, budget), budget) for choice in near]
+    mended = [_mended(workshop, choice, budget) for choice in near]
+    better = [
+        _pruned(workshop, after, budget, len(before.layout.planes)) for before, after in zip(near, mended, strict=True)
+    ]
     finalists = [Choice(choice.layout, _fit(workshop, choice.layout, budget, THOROUGH)) for choice in better]
     best = min(finalists, key=lambda choice: choice.score)
     return best.layout.tree(_kept(workshop, best, budget, size_mm))
@@ -114,7 +118,7 @@ def _kept(workshop: Workshop, best: Choice, budget: int, size_mm: float) -> list
             continue
         fitted = fit_leaves(workshop, [pieces[i] for i in rest], room, THOROUGH)
         share = sum(pieces[i].members.size for i in rest) / len(workshop.solid.samples.points)
-        if (after := share * fitted.mean + fitted.worst * fitted.largest) < score:
+        if (after := share * fitted.mean + workshop.aim.worst * fitted.largest) < score:
             kept, score = tried, after
             for i, leaf in zip(rest, fitted.leaves, strict=True):
                 leaves[i] = leaf
@@ -126,34 +130,48 @@ def _mended(workshop: Workshop, best: Choice, budget: int) -> Choice:
     """Return the layout with cuts through the pieces of the largest misses, as long as that pays."""
     while best.fitted.largest > SPIKE * best.fitted.mean and best.pieces < budget // NUMBERS_A_PIECE:
         order = np.argsort(best.fitted.largests)[::-1][:MENDED]
-        layouts = [layout for k in order for layout in _mends(workshop, best, int(k))]
-        tried = [Choice(layout, _fit(workshop, layout, budget, SCOUT)) for layout in layouts]
-        paying = [choice for choice in tried if choice.score < best.score]
-        if not paying:
-            break
-        best = min(paying, key=lambda choice: choice.score)
-    return best
-
-
-def _mends(workshop: Workshop, choice: Choice, piece: int) -> list[Layout]:
-    """Return layouts with a piece cut for its largest miss: by look-ahead on squares, and for the spot where it is."""
-    solid, whole, spot = workshop.solid, choice.layout.pieces[piece], choice.fitted.spots[piece]
-    splits = best_split(solid, whole, WORST_POWER), best_split(solid, whole, 1.0, spot)
-    return [choice.layout.split(piece, split) for split in splits if split is not None]
-
-
-def _pruned(workshop: Workshop, best: Choice, budget: int) -> Choice:
-    """Return the layout without the lowest cuts that do not pay, as long as one is found."""
-    while best.layout.planes:
-        lowest = np.flatnonzero((best.layout.children < 0).all(axis=1))
-        layouts = [best.layout.merged(workshop.solid, int(k)) for k in lowest]
-        layouts.sort(key=lambda layout: sum(piece.misfit for piece in layout.pieces))
-        tried = [Choice(layout, _fit(workshop, layout, budget, SCOUT)) for layout in layouts[:PRUNED]]
-        better = min(tried, key=lambda choice: choice.score)
-        if better.score >= PRUNING_PAYS * best.score:
+        better = _best_of(workshop, _mends(workshop, best, order), budget, best)
+        if better is None or better.score >= best.score:
             break
         best = better
     return best
+
+
+def _mends(workshop: Workshop, choice: Choice, order: IntArray) -> list[Layout]:
+    """Return layouts with a piece cut for its largest miss: by look-ahead on squares, and for the spot where it is."""
+    layout, spots = choice.layout, choice.fitted.spots
+    ways = [(int(k), power, spot) for k in order for power, spot in ((WORST_POWER, None), (1.0, spots[k]))]
+
+    def cut(at: int) -> Split | None:
+        piece, power, spot = ways[at]
+        return best_split(workshop.solid, layout.pieces[piece], power, spot)
+
+    splits = in_threads(cut, len(ways))
+    return [layout.split(way[0], split) for way, split in zip(ways, splits, strict=True) if split is not None]
+
+
+def _pruned(workshop: Workshop, best: Choice, budget: int, mended: int) -> Choice:
+    """Return the layout without the lowest cuts that do not pay, as long as one is found.
+
+    mended: the first cut that was made for a largest miss: it has just paid.
+    """
+    while best.layout.planes:
+        lowest = [k for k in np.flatnonzero((best.layout.children < 0).all(axis=1)) if k < mended]
+        layouts = [best.layout.merged(workshop.solid, int(k)) for k in lowest]
+        layouts.sort(key=lambda layout: sum(piece.misfit for piece in layout.pieces))
+        better = _best_of(workshop, layouts[:PRUNED], budget, best)
+        if better is None or better.score >= PRUNING_PAYS * best.score:
+            break
+        best, mended = better, mended - 1
+    return best
+
+
+def _best_of(workshop: Workshop, layouts: list[Layout], budget: int, rival: Choice) -> Choice | None:
+    """Return the layout whose quick fit is the best one; those far behind a rival are given up half way."""
+    workshop.prepared([piece for layout in layouts for piece in layout.pieces], SCOUT.stride)
+    fits = in_threads(lambda k: _fit(workshop, layouts[k], budget, SCOUT, rival.fitted), len(layouts))
+    tried = [Choice(layout, fitted) for layout, fitted in zip(layouts, fits, strict=True)]
+    return min(tried, key=lambda choice: choice.score, default=None)
 
 
 def _scouts(workshop: Workshop, parting: Parting, budget: int) -> list[Choice]:
@@ -166,7 +184,8 @@ def _scouts(workshop: Workshop, parting: Parting, budget: int) -> list[Choice]:
         if count < most and (_hopeless(parting, count) or (count > EACH_UP_TO and count % 2)):
             continue
         layout = settled(workshop.solid, parting.layout(count))
-        found.append(Choice(layout, _fit(workshop, layout, budget, SCOUT)))
+        rival = min(found, key=lambda choice: choice.score).fitted if found else None
+        found.append(Choice(layout, _fit(workshop, layout, budget, SCOUT, rival)))
         best = min(found, key=lambda choice: choice.score)
         last = found[-1]
         if last.pieces - best.pieces >= PATIENCE or last.score > 1.5 * best.score:
@@ -185,9 +204,9 @@ def _hopeless(parting: Parting, count: int) -> bool:
     )
 
 
-def _fit(workshop: Workshop, layout: Layout, budget: int, effort: Effort) -> Fitted:
+def _fit(workshop: Workshop, layout: Layout, budget: int, effort: Effort, rival: Fitted | None = None) -> Fitted:
     """Return the fitted leaves of a layout's pieces."""
-    return fit_leaves(workshop, layout.pieces, _numbers(layout, budget), effort)
+    return fit_leaves(workshop, layout.pieces, _numbers(layout, budget), effort, rival)
 
 
 def _numbers(layout: Layout, budget: int) -> int:

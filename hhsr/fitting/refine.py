@@ -54,6 +54,7 @@ class Misses(NamedTuple):
     slope: FloatArray
     share: FloatArray
     near: int
+    nearest: IntArray
 
 
 class Figures(NamedTuple):
@@ -80,21 +81,22 @@ def view_of(directions: FloatArray, leaf: ModelLeaf) -> View:
 
 
 def improved(
-    solid: Solid, task: Task, leaf: ModelLeaf, view: View, steps: int, power: float
+    solid: Solid, task: Task, leaf: ModelLeaf, view: View, steps: int, power: float, before: Misses | None = None
 ) -> tuple[ModelLeaf, Misses]:
     """Return the leaf after some Gauss-Newton steps on its misses, as long as they fall, and its misses.
 
     view: of the task's directions. power: of the misses whose sum is to fall (2: least squares, 1: their mean). A step
-    that does not help is halved, twice at most.
+    that does not help is halved, twice at most. before: what a leaf like it missed, near the same
+    triangles.
     """
-    found = misses(task, solid, leaf, view)
+    found = misses(task, solid, leaf, view, before)
     weight = weights_of(found, solid, power)
     for _ in range(steps):
         change = _change(task, found, weight, leaf, view)
         cost = (weight * found.miss**2).sum()
         for share in SHARES:
             tried = _changed(leaf, share * change)
-            after = misses(task, solid, tried, view)
+            after = misses(task, solid, tried, view, found)
             other = weights_of(after, solid, power)
             if better := bool((other * after.miss**2).sum() < cost):
                 break
@@ -139,10 +141,13 @@ def radii_of(leaf: ModelLeaf, directions: FloatArray, view: View | None = None) 
     return radii
 
 
-def misses(task: Task, solid: Solid, leaf: ModelLeaf, view: View, own: Misses | None = None) -> Misses:
+def misses(
+    task: Task, solid: Solid, leaf: ModelLeaf, view: View, before: Misses | None = None, own: Misses | None = None
+) -> Misses:
     """Return what a leaf misses, both ways: samples that it should meet, its own points that should lie on the source.
 
     And behind cuts: where it falls short of its bounds, and (weak) how far it strays from its base.
+    before: what a leaf like it missed, for a task that may differ in its bounds.
     own: the leaf's misses for a task that differs in its bounds only: what they say of samples and own points stays.
     """
     base = base_radii(leaf, task.directions)
@@ -153,13 +158,16 @@ def misses(task: Task, solid: Solid, leaf: ModelLeaf, view: View, own: Misses | 
         slope[:first] = np.maximum(task.cosine, GRAZING)
         miss[:first] = slope[:first] * (radius[:first] - task.radii)
         share[:first] = 1.0
-        _own_misses(task, solid, leaf, *(a[first:second] for a in (radius, miss, slope, share)))
+        nearest = np.full(second - first, -1) if before is None else before.nearest.copy()
+        mine = [a[first:second] for a in (radius, miss, slope, share)]
+        _own_misses(task, solid, leaf, mine[0], mine[1], mine[2], mine[3], nearest)
     else:
+        nearest = own.nearest
         miss[:second], slope[:second], share[:second] = own.miss[:second], own.slope[:second], own.share[:second]
     short = radius[second:] < task.bound
     miss[second:] = radius[second:] - np.where(short, task.bound, np.maximum(base[second:], task.bound))
     share[second:] = ray_share(solid, BOUND_RAYS) * (task.bound * np.where(short, task.urgency, HOLD)) ** 2
-    return Misses(radius, miss, slope, share, second)
+    return Misses(radius, miss, slope, share, second, nearest)
 
 
 def weights_of(found: Misses, solid: Solid, power: float) -> FloatArray:
@@ -180,6 +188,7 @@ def _own_misses(
     miss: FloatArray,
     slope: FloatArray,
     share: FloatArray,
+    nearest: IntArray,
 ) -> None:
     """Fill in the true signed distances of the leaf's own points, within its region, to the source."""
     boxes, links, corners, _ = solid.triangles.arrays
@@ -200,6 +209,7 @@ def _own_misses(
         miss,
         slope,
         share,
+        nearest,
     )
 
 

@@ -1,9 +1,9 @@
 """How well all pieces of a solid could be told as radii, for many places of one of its planes (DESIGN §3)."""
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
-from hhsr.kernels.lookahead import CELLS, SUMS, add_member, misfit_of_cells
+from hhsr.kernels.lookahead import CELLS, SUMS, misfit_of_cells, term_of
 
 
 @njit(cache=True, nogil=True)
@@ -32,7 +32,7 @@ def leaves_of(points, normals, offsets, children):
     return out
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def misfits_of_places(points, slopes, gaps, centres, normals, offsets, children, moved, tried, heights, least, power):
     """Return (c,) the misfit of all leaves with plane number `moved` in each of c places.
 
@@ -43,7 +43,8 @@ def misfits_of_places(points, slopes, gaps, centres, normals, offsets, children,
     """
     leaves = centres.shape[0]
     out = np.empty(tried.shape[0])
-    for c in prange(tried.shape[0]):
+    sums, count, term = np.empty((leaves, CELLS, SUMS)), np.empty(leaves, np.int64), np.empty(SUMS)
+    for c in range(tried.shape[0]):
         nx, ny, nz, offset = tried[c, 0], tried[c, 1], tried[c, 2], heights[c]
         out[c] = np.inf
         stays = True
@@ -53,8 +54,8 @@ def misfits_of_places(points, slopes, gaps, centres, normals, offsets, children,
                 stays = False
         if not stays:
             continue
-        sums = np.zeros((leaves, CELLS, SUMS))
-        count = np.zeros(leaves, np.int64)
+        sums[:] = 0.0
+        count[:] = 0
         total = 0.0
         for i in range(points.shape[0]):
             x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -63,7 +64,9 @@ def misfits_of_places(points, slopes, gaps, centres, normals, offsets, children,
             if gaps[k, i] > 0.0:
                 total += gaps[k, i]
             else:
-                add_member(x - centres[k, 0], y - centres[k, 1], z - centres[k, 2], slopes, i, sums[k])
+                cell = term_of(x - centres[k, 0], y - centres[k, 1], z - centres[k, 2], slopes, i, term)
+                for t in range(SUMS):
+                    sums[k, cell, t] += term[t]
         if count.min() < least:
             continue
         for k in range(leaves):

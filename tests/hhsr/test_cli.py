@@ -74,6 +74,18 @@ def test_fit_prints_what_was_asked_for(folder: Path) -> None:
     assert figures["bytes"] == (folder / "body.hhsr").stat().st_size
 
 
+def test_what_a_fit_may_buy_and_aim_at_reaches_it(folder: Path) -> None:
+    out = folder / "bought.hhsr"
+    words = ("--frame", "RAS", "--max-parameters", 60, "--bases", "any", "--max-error-weight", 0.5, "-o", out, "--json")
+    assert json_of("fit", folder / "body.ply", *words)["parameters"] <= 60
+    assert hhsr.load(out).provenance.options == {"max_parameters": 60, "bases": "any", "max_error_weight": 0.5}
+    goal = ("--frame", "RAS", "--max-mean-error", 0.5, "--max-error", 4, "-o", out, "--json")
+    figures = json_of("fit", folder / "body.ply", *goal)
+    assert figures["mean_error_mm"] <= 0.5
+    assert figures["max_error_mm"] <= 4
+    assert hhsr.load(out).provenance.options == {"max_mean_error_mm": 0.5, "max_error_mm": 4.0}
+
+
 def test_info_tells_the_same(folder: Path) -> None:
     figures = json_of("info", folder / "body.hhsr", "--json")
     assert set(figures) >= NAMES
@@ -185,6 +197,8 @@ def test_a_label_map_asks_for_its_label(folder: Path) -> None:
         (("fit", "{}/body.ply", "-o", "{}/nowhere/o.hhsr"), "folder"),
         (("fit", "{}/body.ply", "--frame", "XYZ", "-o", "{}/o.hhsr"), "three letters"),
         (("fit", "{}/body.ply", "--max-parameters", "3", "-o", "{}/o.hhsr"), "max_parameters"),
+        (("fit", "{}/body.ply", "--bases", "none", "-o", "{}/o.hhsr"), "bases"),
+        (("fit", "{}/body.ply", "--max-error-weight", "2", "-o", "{}/o.hhsr"), "max_error_weight"),
         (("fit", "{}/body.ply", "--unit", "m", "--recipe", "none", "-o", "{}/o.hhsr"), "recipe"),
         (("mesh", "{}/body.hhsr", "-o", "{}/o.xyz"), ".ply"),
         (("query", "{}/body.hhsr", "contains", "{}/bad.csv", "-o", "{}/o.csv"), "line 3"),

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import threading
+
+import numba
 import numpy as np
 import pytest
 import trimesh
 
 from hhsr.fitting.aim import aim_of
 from hhsr.fitting.closing import closed, with_section
+from hhsr.fitting.leaves import SCOUT, Workshop, fit_leaves
 from hhsr.fitting.lookahead import Layout, Parting
 from hhsr.fitting.normalise import normalise, on_grid, scaled
 from hhsr.fitting.planes import settled
-from hhsr.fitting.refine import improved, radii_of, view_of, weights_of
+from hhsr.fitting.refine import improved, misses, radii_of, view_of, weights_of
 from hhsr.fitting.samples import side_by_side, turned_fibonacci
 from hhsr.fitting.scale_field import NONE, fit_ellipsoid, grid_for, leaf_of, select_centres
 from hhsr.fitting.section import Section, section_of
 from hhsr.fitting.solid import Solid, solid_of
 from hhsr.fitting.task import first_rows, start_rows, task_of
+from hhsr.fitting.threads import in_threads
 from hhsr.kernels.refinement import ellipsoid_radii
 from hhsr.model import Cut, ModelLeaf, ScaleField, frozen
 
@@ -113,7 +118,8 @@ def test_voids_behind_cuts_are_closed_and_never_made(solid: Solid) -> None:
         axes = fit_ellipsoid(rows)
         field = select_centres(rows, axes, grid_for(300), 40, NONE).field(40)
         leaf = leaf_of(piece.centre, 0.97 * axes, field)
-        before, after = voids(section, leaf), voids(section, closed(solid, task, section, leaf, aim_of(0.01))[0])
+        found = misses(task, solid, leaf, view_of(task.directions, leaf))
+        before, after = voids(section, leaf), voids(section, closed(solid, task, section, leaf, found, aim_of(0.01))[0])
         assert before > 0.0
         assert after <= before
         assert with_section(task, section).behind.shape[0] >= task.behind.shape[0]
@@ -155,6 +161,47 @@ def test_a_step_that_does_not_help_is_halved_and_misses_never_grow(solid: Solid)
         costs.append(float((weights_of(found, solid, 1.5) * found.miss**2).sum()))
     assert (np.diff(costs) <= 0.0).all()
     assert costs[3] < 0.5 * costs[0]
+
+
+def test_what_a_leaf_misses_does_not_depend_on_where_one_looks_first(solid: Solid) -> None:
+    piece = Parting(solid).pieces(1)[0]
+    task = task_of(solid, piece.region, piece.members, piece.centre, 1)
+    one = leaf_of(piece.centre, fit_ellipsoid(start_rows(task, solid)), ScaleField.none())
+    other = leaf_of(piece.centre, 1.1 * np.asarray(one.superquadric.half_axes), ScaleField.none())
+    view = view_of(task.directions, other)
+    plain, told = misses(task, solid, other, view), misses(task, solid, other, view, misses(task, solid, one, view))
+    assert np.allclose(np.abs(plain.miss), np.abs(told.miss), rtol=0.0, atol=1e-12)
+    assert (plain.nearest >= 0).all()
+    again = misses(task, solid, other, view, own=plain)
+    assert np.array_equal(again.miss, plain.miss)
+
+
+def test_a_fit_far_behind_its_rival_is_given_up(solid: Solid) -> None:
+    parting = Parting(solid)
+    assert parting.grown(3)
+    workshop = Workshop(solid, aim_of(0.01))
+    best = fit_leaves(workshop, parting.pieces(3), 120, SCOUT)
+    assert best.mean < best.first
+    assert best.score == pytest.approx(best.mean + 0.01 * best.largest)
+    worse = fit_leaves(workshop, parting.pieces(1), 120, SCOUT, best)
+    assert worse.first == worse.mean > 1.3 * best.first
+    assert worse.score > 1.3 * best.score
+    near = fit_leaves(workshop, parting.pieces(3), 100, SCOUT, best)
+    assert near.mean < near.first
+
+
+def test_work_handed_out_by_a_thread_stays_in_it() -> None:
+    def outer(k: int) -> tuple[int, list[bool]]:
+        own = threading.get_ident()
+        return k, [n == own for n in in_threads(lambda _: threading.get_ident(), 3)]
+
+    usual = numba.get_num_threads()
+    try:
+        numba.set_num_threads(min(2, numba.config.NUMBA_NUM_THREADS))
+        assert in_threads(outer, 4) == [(k, [True] * 3) for k in range(4)]
+        assert in_threads(lambda k: k * k, 5) == [0, 1, 4, 9, 16]
+    finally:
+        numba.set_num_threads(usual)
 
 
 def test_directions_side_by_side_are_the_same_ones_nearer_to_each_other() -> None:

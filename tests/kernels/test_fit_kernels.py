@@ -276,6 +276,26 @@ def test_a_cut_between_two_spheres_finds_both_centres() -> None:
     assert (misfit[:, 1, 0] > 1.0).all()  # one centre for both spheres
 
 
+def test_each_side_of_a_cut_is_judged_as_if_it_were_a_part() -> None:
+    points, normals = sphere_samples(np.zeros(3), 10.0)
+    points = points * (1.0, 0.7, 1.6)
+    order = np.arange(0, 600, 2)
+    rng = np.random.default_rng(4)
+    candidates = rng.normal(size=(5, 3)) * 2.0
+    gaps = np.where(rng.random((5, 300)) < 0.1, rng.random((5, 300)), 0.0)
+    along = directions(6)
+    heights, inside = along @ points[order].T, along @ candidates.T
+    planes = np.sort(rng.normal(size=(6, 4)) * 4.0, axis=1)
+    for power in (1.0, 1.5):
+        misfit, which = lookahead.best_centres(points, normals, order, gaps, heights, planes, candidates, inside, power)
+        for d, k in np.ndindex(6, 4):
+            for side, members in enumerate((heights[d] < planes[d, k], heights[d] >= planes[d, k])):
+                held = (inside[d] > planes[d, k]) == bool(side)
+                whole = lookahead.misfits(points, normals, order[members], gaps[:, members].copy(), candidates, power)
+                assert misfit[d, k, side] == pytest.approx(whole[held].min(initial=np.inf))
+                assert which[d, k, side] == (np.where(held, whole, np.inf).argmin() if held.any() else -1)
+
+
 def test_a_plane_between_three_spheres_is_judged_by_all_of_them() -> None:
     middles = np.array([[-20.0, 0, 0], [0.0, 20.0, 0], [20.0, 0, 0]])
     parts = [sphere_samples(m, 8.0) for m in middles]
@@ -335,9 +355,16 @@ def test_own_misses_are_signed_distances_and_their_slopes() -> None:
     radius = np.array([0.7, 1.1, 1.5, 0.5, 1.25])
     miss, slope, share = np.full(5, 9.0), np.full(5, 9.0), np.full(5, 9.0)
     normals, offsets = np.array([[0.0, 1.0, 0.0]]), np.array([-0.25])  # y ≥ −0.25: the fourth point lies outside
+    nearest = np.array([-1, 3, -1, -1, 0])
     refinement.own_misses(
-        boxes, links, triangles, normals, offsets, np.zeros(3), u, radius, 0.2, 1e-9, 2.0, miss, slope, share
+        boxes, links, triangles, normals, offsets, np.zeros(3), u, radius, 0.2, 1e-9, 2.0, miss, slope, share, nearest
     )
+    known = [np.full(5, 9.0) for _ in range(3)]
+    assert nearest[3] == -1
+    refinement.own_misses(
+        boxes, links, triangles, normals, offsets, np.zeros(3), u, radius, 0.2, 1e-9, 2.0, *known, nearest
+    )
+    assert np.array_equal(known, [miss, slope, share])
     np.testing.assert_allclose(miss, [-0.3, -0.12, 0.5, 9.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(slope, [1.0, 0.8, 1.0, 9.0, 0.8], atol=1e-12)
     np.testing.assert_allclose(share, [2 * 0.49, 2 * 1.21 / 0.8, 4.5, 9.0, 2 * 1.5625 / 0.8], rtol=1e-12)
@@ -345,7 +372,7 @@ def test_own_misses_are_signed_distances_and_their_slopes() -> None:
     one = np.array([0.9]), np.zeros(1), np.zeros(1), np.zeros(1)
     refinement.own_misses(
         boxes, links, triangles, np.zeros((0, 3)), np.zeros(0), np.array([0.95, 0.0, 0.0]), grazing, *one[:1],
-        0.2, 1e-9, 1.0, *one[1:],
+        0.2, 1e-9, 1.0, *one[1:], np.full(1, -1),
     )  # fmt: skip
     assert one[1][0] == pytest.approx(-0.05)
     assert abs(one[2][0]) == pytest.approx(0.2)  # the nearest wall runs along the ray: the slope is held at 0.2
