@@ -186,7 +186,8 @@ def test_a_fit_far_behind_its_rival_is_given_up(solid: Solid) -> None:
     worse = fit_leaves(workshop, parting.pieces(1), 120, SCOUT, best)
     assert worse.first == worse.mean > 1.3 * best.first
     assert worse.score > 1.3 * best.score
-    near = fit_leaves(workshop, parting.pieces(3), 100, SCOUT, best)
+    near = fit_leaves(workshop, parting.pieces(3), 118, SCOUT, best)
+    assert near.first < 1.3 * best.first
     assert near.mean < near.first
 
 
