@@ -139,7 +139,7 @@ def settle_square(blob, ints, tab, leaf, planes, count, search, face, o, a, b, h
             if radius <= 0.0:
                 return True
             clear, da, db = square_is_clear(
-                search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink if whole else 2.0 * kink, third
+                search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third
             )
             if clear or turn == 1:
                 break
@@ -150,7 +150,8 @@ def settle_square(blob, ints, tab, leaf, planes, count, search, face, o, a, b, h
             if not distance < search[BEST] or outside_region(blob, planes, count, x, y, z, 1e-9):
                 break
             offer(search, distance, t, x, y, z)
-        whole = False
+        if whole:  # its bounds are from its own middle: between two other points twice as much
+            kink, third, whole = 2.0 * kink, 2.0 * third, False
         if clear or half / w < FINEST:
             continue
         if not parting or depth + 4 > NODE_ROOM:

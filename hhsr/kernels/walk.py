@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from hhsr.kernels.cell import leaf_implicit
+from hhsr.kernels.chart_walk import follow_cells
 from hhsr.kernels.clipped import follow_tree, merge_touches
 from hhsr.kernels.layout import (
     FRAME,
@@ -76,9 +77,9 @@ def _close_run(
             work[RUN, RUN_LEAST], work[RUN, RUN_MOST], bend, tolerance / length,
         )  # fmt: skip
     else:
-        state, count = settle_stretch(
-            blob, ints, leaf, px, py, pz, dx, dy, dz, begin, end, bend, resolution / length, tolerance / length, gap,
-            state, out, count, work,
+        state, count = follow_cells(
+            blob, ints, tab, leaf, px, py, pz, dx, dy, dz, length, begin, end, resolution, tolerance, gap, state, out,
+            count, work,
         )  # fmt: skip
     return change(state, new, end, gap, out, count)
 
