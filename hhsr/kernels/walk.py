@@ -34,9 +34,10 @@ from hhsr.kernels.voxels import (
     BRICKS,
     BYTES,
     DETAILS,
-    IN_BYTE,
     LEAPS,
     NO_SURFEL,
+    OCTANT_BYTES,
+    OUT_BYTE,
     PLANES,
     solid_contains,
 )
@@ -156,6 +157,7 @@ def follow_voxels(
     ox, oy, oz = (1 - sx) >> 1, (1 - sy) >> 1, (1 - sz) >> 1
     octant = (1 - ox) + 2 * (1 - oy) + 4 * (1 - oz)
     leaps = ints[c + LEAPS] + octant * (nx * ny * nz)
+    voxels += octant * ints[c + OCTANT_BYTES]
     nudge = max(NUDGE * min(1.0, blob[f + 3]) / length, 1e-15)
     speed = math.sqrt(vx * vx + vy * vy + vz * vz)
     t = start + nudge if start > 0.0 else 0.0
@@ -207,13 +209,15 @@ def follow_voxels(
                 ez = ((bk + sz + oz) << 2) * iz + kz
             else:
                 byte = np.int64(octets[voxels + 64 * slot + (((i & 3) << 4) | ((j & 3) << 2) | (k & 3))])
+                r = np.int64(1)
                 if byte > NO_SURFEL:
-                    known = 1 if byte == IN_BYTE else 0
+                    known = 1 if byte < OUT_BYTE else 0
+                    r = byte - (NO_SURFEL if byte < OUT_BYTE else OUT_BYTE - 1)
                 elif byte < NO_SURFEL:
                     surfel = np.int64(words[bases + slot]) + byte
-                ex = (i + sx + ox) * ix + kx
-                ey = (j + sy + oy) * iy + ky
-                ez = (k + sz + oz) * iz + kz
+                ex = (i + sx * r + ox) * ix + kx
+                ey = (j + sy * r + oy) * iy + ky
+                ez = (k + sz * r + oz) * iz + kz
         end = min(min(ex, ey), min(min(ez, near), stop))
         a, b, after, owner, cut = t, end, UNKNOWN, -1, False
         slope = stray = bend = guess = 0.0
