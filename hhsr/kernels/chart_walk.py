@@ -1,8 +1,10 @@
 """A stretch of a segment followed through one leaf's chart, cell by cell: what voxels' planes leave open most often.
 
-A cell is a few times smaller than a voxel, and its model as much nearer to W: nearly every piece in one is proven inside,
-outside or monotone by the table alone. Only the crossing itself asks the formulas.
+A cell is a few times smaller than a voxel, and its model as much nearer to W: nearly every piece in one is proven
+inside, outside or monotone by the table alone. Only the crossing itself asks the formulas.
 """
+
+import math
 
 from hhsr.kernels.cell import chart_of, face_of, inverse_radius
 from hhsr.kernels.clipped import merge_touches
@@ -14,12 +16,11 @@ from hhsr.kernels.stretch import change
 from hhsr.kernels.unmanaged import inlined, unmanaged
 
 NUDGE = 1e-11  # of (a, b): past a cell's border, less than models are proven beyond theirs
-MOST_PIECES = 10_000
 
 
 @inlined
-def _exit(x, start, way, low, high):
-    """Return the share at which start + x·way leaves [low, high]; at once where it is at an end and goes out."""
+def _exit(start, way, low, high):
+    """Return the share x at which start + x·way leaves [low, high]."""
     if way > 0.0:
         return (high - start) / way
     return (low - start) / way if way < 0.0 else 2.0
@@ -32,8 +33,8 @@ def follow_cells(
 ):  # fmt: skip
     """Follow p + t·d (leaf's frame) for t in [begin, end]; return (state, count).
 
-    length: |d|, mm. resolution, tolerance: mm; gap: of t. A stretch over more than one face of the chart, and pieces that their cell's
-    model does not settle, are parted by `hhsr.kernels.segment`. work: scratch.
+    length: |d|, mm. resolution, tolerance: mm; gap: of t. A stretch over more than one face of the chart, and pieces
+    that their cell's model does not settle, are parted by `hhsr.kernels.segment`. work: scratch.
     """
     t = 0.5 * (begin + end)
     face, _, _, _ = face_of(px + t * dx, py + t * dy, pz + t * dz)
@@ -46,16 +47,16 @@ def follow_cells(
         return state, merge_touches(out, count, gap)
     w0, w1 = 1.0 / m0, 1.0 / m1
     wa, wb, ww = a1 - a0, b1 - b0, w1 - w0
-    far = max(abs(wa), abs(wb))
-    nudge = NUDGE / far if far > NUDGE else 1.0
+    # The cell ahead is asked for: on a border the one behind would be left at once, and again and again.
+    ahead_a, ahead_b = math.copysign(NUDGE, wa), math.copysign(NUDGE, wb)
+    least = NUDGE / max(abs(wa), abs(wb), NUDGE)
     # What a tolerance is as a share of the stretch: mm for a share are at most these.
     share = tolerance * min(w0, w1) / (length * (end - begin) * max(w0, w1))
     x = 0.0
     while x < 1.0:
-        xn = min(x + nudge, 1.0)
-        o, ca, cb, half = cell_at(ints, leaf, face, a0 + xn * wa, b0 + xn * wb)
-        stop = min(_exit(xn, a0, wa, ca - half, ca + half), _exit(xn, b0, wb, cb - half, cb + half))
-        stop = min(max(stop, xn), 1.0)
+        o, ca, cb, half = cell_at(ints, leaf, face, a0 + x * wa + ahead_a, b0 + x * wb + ahead_b)
+        stop = min(_exit(a0, wa, ca - half, ca + half), _exit(b0, wb, cb - half, cb + half))
+        stop = min(max(stop, x + least), 1.0)
         sa, sb, error = float(tab[o + SLOPE_A]), float(tab[o + SLOPE_B]), float(tab[o + ERROR])
         f = w0 - (float(tab[o + VALUE]) + sa * (a0 - ca) + sb * (b0 - cb))
         slope = ww - sa * wa - sb * wb

@@ -138,9 +138,7 @@ def settle_square(blob, ints, tab, leaf, planes, count, search, face, o, a, b, h
             radius = min(search[BEST] - search[TOLERANCE], WIDEST)
             if radius <= 0.0:
                 return True
-            clear, da, db = square_is_clear(
-                search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third
-            )
+            clear, da, db = square_is_clear(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third)
             if clear or turn == 1:
                 break
             x, y, z = direction_of(face, a + da, b + db)
