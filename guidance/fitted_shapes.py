@@ -21,7 +21,7 @@ from guidance.errors import SceneError
 if TYPE_CHECKING:
     from hhsr import Shape
 
-RECIPE = 4  # raise when the same options should be fitted anew
+RECIPE = 5  # raise when the same options should be fitted anew
 _HHSR = "from hhsr.cli import app; app()"  # the command by this interpreter, wherever its script lies
 
 

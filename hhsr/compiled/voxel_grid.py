@@ -39,16 +39,17 @@ def voxel_grid(blob: FloatArray, low: FloatArray, side: float, counts: np.ndarra
     leaps = np.empty((8, *states.shape), dtype=np.int8)
     for octant in range(8):
         voxel_at.fill_octant(states, octant, leaps[octant])
+    octants = _with_leaps(states, octets)
     slots = np.where(states > 0, voxel_at.INSIDE_BRICK, voxel_at.OUTSIDE_BRICK).astype(np.int32)
     slots[states == 0] = np.arange(len(mixed))
     start = len(blob)
     frame = np.array([*low, side, 1.0 / side])
     tables: list[np.ndarray] = [
-        frame, leaps, slots, bases, octets, planes[:, :DETAIL], surfels[:, :DETAIL], surfels[:, DETAIL:],
+        frame, leaps, slots, bases, octants, planes[:, :DETAIL], surfels[:, :DETAIL], surfels[:, DETAIL:],
     ]  # fmt: skip
     places = np.concatenate([[0], np.cumsum([-(-table.nbytes // 8) for table in tables])]) + start + voxel_at.VOXEL_INTS
     record = np.zeros(voxel_at.VOXEL_INTS, dtype=np.int64)
-    record[:3] = counts
+    record[:3], record[voxel_at.OCTANT_BYTES] = counts, octets.size
     record[voxel_at.LEAPS], record[voxel_at.BYTES] = 8 * places[1], 8 * places[4]
     record[voxel_at.BRICKS], record[voxel_at.BASES] = 2 * places[2], 2 * places[3]
     grown = joined([blob, record, *tables])
@@ -57,3 +58,19 @@ def voxel_grid(blob: FloatArray, low: FloatArray, side: float, counts: np.ndarra
     record[voxel_at.BRICK_PLANES : voxel_at.DETAILS + 1] = 2 * (places[5:8] - head[at.MAP_START])
     head[at.VOXELS], head[at.VOXEL_FRAME] = start, places[0]
     return grown
+
+
+def _with_leaps(bricks: np.ndarray, octets: np.ndarray) -> np.ndarray:
+    """Return the bytes (8, n, 64) of the bricks with voxels, with each octant's leaps in them."""
+    states = np.empty(tuple(voxel_at.BRICK * n for n in bricks.shape), dtype=np.int8)
+    voxel_at.state_voxels(bricks, octets, states)
+    out = np.empty((8, *octets.shape), dtype=np.uint8)
+
+    def fill(i: int, j: int) -> None:
+        for octant in range(i, j):
+            leaps = np.empty_like(states)
+            voxel_at.fill_octant(states, octant, leaps)
+            voxel_at.fill_bytes(bricks, leaps, octets, out[octant])
+
+    in_parts(8, 1, fill)
+    return out

@@ -14,7 +14,7 @@ from hhsr.fitting.base import base_radii, local
 from hhsr.fitting.bases import base_that_pays
 from hhsr.fitting.closing import closed
 from hhsr.fitting.lookahead import Piece
-from hhsr.fitting.refine import Figures, Misses, figures, improved, mending_rows, view_of
+from hhsr.fitting.refine import Figures, Misses, figures, improved, mending_rows, radii_of, view_of
 from hhsr.fitting.rows import Rows
 from hhsr.fitting.scale_field import (
     NONE,
@@ -26,7 +26,7 @@ from hhsr.fitting.scale_field import (
     grid_for,
     leaf_of,
 )
-from hhsr.fitting.section import Section, section_of
+from hhsr.fitting.section import Section, near_voids, section_of
 from hhsr.fitting.solid import Solid
 from hhsr.fitting.spend import counts_within
 from hhsr.fitting.task import Task, first_rows, hint_rows, start_rows, task_of
@@ -41,6 +41,7 @@ class Effort(NamedTuple):
     """Centres of the finest grid for each number to spend, Gauss-Newton steps in a row, rounds of swaps at most.
 
     stride: of how many samples and rays one is looked at. bases: whether richer ones may be bought, if at all.
+    voids: whether such as are too small for a section's points are looked for.
     """
 
     atoms: int
@@ -48,10 +49,11 @@ class Effort(NamedTuple):
     swaps: int
     stride: int
     bases: bool
+    voids: bool
 
 
-SCOUT = Effort(5, 2, 1, 2, bases=False)
-THOROUGH = Effort(7, 3, 3, 1, bases=True)
+SCOUT = Effort(5, 2, 1, 2, bases=False, voids=False)
+THOROUGH = Effort(7, 3, 3, 1, bases=True, voids=True)
 SWAPPED = 0.3
 FURTHER = 1.3
 SEED = 5
@@ -145,7 +147,22 @@ def fit_leaves(
         if swapped.mean >= best.mean:
             break
         best, found = swapped, after
+    if effort.voids:
+        ready = _searched(workshop, ready, best, found)
     return _closed(workshop, ready, best, found)._replace(first=first)
+
+
+def _searched(workshop: Workshop, ready: list[Prepared], fitted: Fitted, found: list[Misses]) -> list[Prepared]:
+    """Return the pieces with more points of their planes where a void may hide that is worse than any other miss."""
+    missed = [np.abs(misses.miss[: misses.near][misses.share[: misses.near] > 0.0]) for misses in found]
+    least = max((float(miss.max(initial=0.0)) for miss in missed), default=0.0)
+
+    def search(k: int) -> Prepared:
+        piece, leaf = ready[k].piece, fitted.leaves[k]
+        near = near_voids(workshop.solid, piece.region, leaf.centre, lambda along: radii_of(leaf, along), least)
+        return ready[k]._replace(section=ready[k].section.joined(near))
+
+    return in_threads(search, len(ready))
 
 
 def _closed(workshop: Workshop, ready: list[Prepared], fitted: Fitted, found: list[Misses]) -> Fitted:

@@ -120,7 +120,7 @@ def figures(
     own = np.flatnonzero(found.share[: found.near] > 0.0)
     miss = np.abs(found.miss[own])
     void = radii_of(leaf, section.along, view) < section.reach
-    lost = float(section.depth[void].sum()) * section.cell / (solid.sample_area * task.stride)
+    lost = float((section.depth * section.cell)[void].sum()) / (solid.sample_area * task.stride)
     total = 0.5 * (float((miss * found.share[own]).sum()) + lost)
     surface = leaf.centre + np.concatenate(
         [found.radius[own, None] * task.directions[own], section.reach[void, None] * section.along[void]]

@@ -250,12 +250,12 @@ def deepest(
         t = t0 if k == 0 else t1
         x, y, z = px + t * dx, py + t * dy, pz + t * dz
         if not (on0 if k == 0 else on1):
+            # Some surface point will do: if the bound is highest here, the true distance is asked below.
             set_search(search, x, y, z, 0.0, 0.0, 0.0, inner)
-            search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+            seed_point(blob, ints, search)
+            if search[BEST] == FAR:
+                search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
             x, y, z = search[FOOT], search[FOOT + 1], search[FOOT + 2]
-            if search[BEST] > best:
-                best = search[BEST]
-                out[0], out[1], out[2], out[3] = t, x, y, z
         o = 4 * k
         spans[0, o], spans[0, o + 1], spans[0, o + 2], spans[0, o + 3] = t, x, y, z
     _put_span(

@@ -26,7 +26,7 @@ from hhsr.kernels.maps import bend_over, plane_of
 from hhsr.kernels.unmanaged import unmanaged
 
 STEPS = 5
-WIDEST = 3  # base cells a side that a ball may cover
+WIDEST = 6  # base cells a side that a ball may cover
 
 
 @unmanaged

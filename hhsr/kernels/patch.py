@@ -187,7 +187,7 @@ def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, kink,
                 if w > 0.0:
                     # Over the part W − tangent lies in half² [min(bend_lo, 0), max(bend_hi, 0)].
                     middle, wide = 0.5 * (waa + wbb), math.sqrt(0.25 * (waa - wbb) ** 2 + wab * wab)
-                    wide += 2.0 * kink + third * half * math.sqrt(2.0)
+                    wide += 2.0 * (kink + third * half * math.sqrt(2.0))
                     up, down = half * half * max(middle + wide, 0.0), half * half * min(middle - wide, 0.0)
                     value, error = w + 0.5 * (up + down), 0.5 * (up - down) + 1e-12 * w
             if w == 0.0:

@@ -138,9 +138,7 @@ def settle_square(blob, ints, tab, leaf, planes, count, search, face, o, a, b, h
             radius = min(search[BEST] - search[TOLERANCE], WIDEST)
             if radius <= 0.0:
                 return True
-            clear, da, db = square_is_clear(
-                search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink if whole else 2.0 * kink, third
-            )
+            clear, da, db = square_is_clear(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third)
             if clear or turn == 1:
                 break
             x, y, z = direction_of(face, a + da, b + db)
@@ -150,7 +148,8 @@ def settle_square(blob, ints, tab, leaf, planes, count, search, face, o, a, b, h
             if not distance < search[BEST] or outside_region(blob, planes, count, x, y, z, 1e-9):
                 break
             offer(search, distance, t, x, y, z)
-        whole = False
+        if whole:  # its bounds are from its own middle: between two other points twice as much
+            kink, third, whole = 2.0 * kink, 2.0 * third, False
         if clear or half / w < FINEST:
             continue
         if not parting or depth + 4 > NODE_ROOM:

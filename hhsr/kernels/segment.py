@@ -165,7 +165,7 @@ def leaf_crossings(
             face = 2 if y >= 0.0 else 3
         else:
             face = 4 if z >= 0.0 else 5
-        state, count = _face_crossings(
+        state, count = face_crossings(
             blob,
             ints,
             tab,
@@ -193,10 +193,10 @@ def leaf_crossings(
 
 
 @unmanaged
-def _face_crossings(
+def face_crossings(
     blob, ints, tab, leaf, face, px, py, pz, dx, dy, dz, ta, tb, speed, resolution, tolerance, state, out, count, work
 ):
-    """Follow the segment over one face."""
+    """Follow p + t·d for t in [ta, tb], all of it over one face: `leaf_crossings`. speed: |d|, mm."""
     n = ints[leaf + CELLS]
     a0, b0, m0 = chart_of(face, px + ta * dx, py + ta * dy, pz + ta * dz)
     a1, b1, m1 = chart_of(face, px + tb * dx, py + tb * dy, pz + tb * dz)

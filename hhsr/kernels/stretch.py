@@ -1,7 +1,7 @@
 """Where a straight line crosses one leaf's own function F = N/(1 − s), along a stretch over which its bend is known.
 
-One exact value and slope at t, and a bound B of the second derivative along the line, hold F between two parabolas:
-they settle most stretches at once, and one Newton step from there leaves no more than B·Δ²/2.
+With one exact value and slope at t, and a bound B of the second derivative along the line, a Newton step leaves no
+more than B·Δ²/2.
 """
 
 import math
@@ -105,49 +105,3 @@ def root_in(blob, ints, leaf, px, py, pz, dx, dy, dz, lo, hi, guess, rises, leas
         if not lo < t < hi or turn % 3 == 2:
             t = 0.5 * (lo + hi)
     return 0.5 * (lo + hi)
-
-
-@unmanaged
-def settle_stretch(
-    blob, ints, leaf, px, py, pz, dx, dy, dz, a, b, bend, resolution, tolerance, gap, state, out, count, work
-):
-    """Follow F along p + t·d (leaf's frame), t in [a, b], over which `bend` (finite) holds; return (state, count).
-
-    resolution, tolerance, gap: of t. A piece shorter than the resolution that no proof settles is settled by its ends.
-    work: (PIECES, …) scratch.
-    """
-    depth = 0
-    end = b
-    while True:
-        t, half = 0.5 * (a + b), 0.5 * (b - a)
-        f, slope = excess_along(blob, ints, leaf, px + t * dx, py + t * dy, pz + t * dz, dx, dy, dz)
-        stray = 0.5 * bend * half * half * (1.0 + 1e-9) + 1e-11
-        split = False
-        if abs(f) > abs(slope) * half + stray:
-            state, count = change(state, f < 0.0, a, gap, out, count)
-        elif abs(slope) > bend * half * (1.0 + 1e-9) or b - a <= resolution or depth == PIECES:
-            # One crossing at most (or no room for two): the states at the ends, by the parabolas or by exact values.
-            f0, f1 = f - slope * half, f + slope * half
-            if abs(f0) <= stray:
-                f0 = excess(blob, ints, leaf, px + a * dx, py + a * dy, pz + a * dz)
-            if abs(f1) <= stray:
-                f1 = excess(blob, ints, leaf, px + b * dx, py + b * dy, pz + b * dz)
-            state, count = change(state, f0 <= 0.0, a, gap, out, count)
-            if (f0 <= 0.0) != (f1 <= 0.0):
-                least = max(abs(slope) - bend * half, 0.0)
-                t = root_in(
-                    blob, ints, leaf, px, py, pz, dx, dy, dz, a, b, t - f / slope if slope != 0.0 else t,
-                    f1 > 0.0, least, abs(slope) + bend * half, bend, tolerance,
-                )  # fmt: skip
-                state, count = change(state, f1 <= 0.0, t, gap, out, count)
-        else:
-            split = True
-        if split:
-            work[depth, 0] = b
-            depth += 1
-            b = t
-            continue
-        if depth == 0 or b >= end:
-            return state, count
-        depth -= 1
-        a, b = b, work[depth, 0]

@@ -190,8 +190,10 @@ def _prove_side(blob, ints, tab, owner, x, y, z, half, side, q, e, acc, plane, o
             state = OUT
         elif level + reach < -thick:
             state = IN
-        elif plane[DETAIL + BEND] == np.inf and thick > steep:
-            return -1
+        elif reach < thick:  # the plane decides nothing: a few cells' own planes may
+            state = leaf_box_state(blob, ints, tab, leaf, q, e)
+            if state == MIXED and plane[DETAIL + BEND] == np.inf and thick > steep:
+                return -1
         out[NORMAL], out[NORMAL + 1], out[NORMAL + 2] = gx / thick, gy / thick, gz / thick
         out[OFFSET], out[DETAIL + THICK] = level / thick, thick
         out[DETAIL + TURN] = plane[DETAIL + TURN] * side * (1.0 + 1e-6) + 1e-6 * steep

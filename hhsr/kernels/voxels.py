@@ -2,7 +2,8 @@
 
 Voxels come in bricks of 4³. A brick that is proven whole has a leap for each octant of directions: the greatest cube of
 bricks, from it on that way, in which nothing changes. The others have a plane (`hhsr.kernels.surfel`) that decides most
-of the brick, and each of their voxels a byte: inside, outside, or the number of its own surfel in the brick.
+of the brick, and each of their voxels a byte: the number of its own surfel in the brick; or that it is proven, and for
+each octant of directions the greatest cube of voxels, from it on that way, in which nothing changes.
 """
 
 import math
@@ -32,10 +33,14 @@ COARSE = 8  # bricks a side of the first cubes that are tried
 NODES = 256
 # The grid's record, integer slots: bricks along x, y, z; then where its tables begin: octants' leaps (bytes), bricks
 # (32 bits: the number of a brick with voxels; −1 inside, −2 outside), of bricks with voxels the first surfel (32 bits),
-# the 64 bytes, and the brick's own plane (float32 slot); of surfels the planes and the details (float32 slots).
-LEAPS, BRICKS, BASES, BYTES, BRICK_PLANES, PLANES, DETAILS, VOXEL_INTS = 3, 4, 5, 6, 7, 8, 9, 10
+# the 64 bytes (of the first octant; OCTANT_BYTES on, of the next), and the brick's own plane (float32 slot); of surfels
+# the planes and the details (float32 slots).
+LEAPS, BRICKS, BASES, BYTES, BRICK_PLANES, PLANES, DETAILS, OCTANT_BYTES, VOXEL_INTS = 3, 4, 5, 6, 7, 8, 9, 10, 11
 INSIDE_BRICK, OUTSIDE_BRICK = -1, -2
-NO_SURFEL, IN_BYTE, OUT_BYTE = 64, 65, 66  # 0 … 63: a surfel of the brick
+# A byte: 0 … 63 a surfel of the brick, NO_SURFEL, from IN_BYTE on inside with a leap of 1 and more, from OUT_BYTE on
+# outside.
+NO_SURFEL, IN_BYTE, OUT_BYTE = 64, 65, 160
+FARTHEST = OUT_BYTE - IN_BYTE  # voxels a leap
 LONGEST = 127  # bricks
 
 
@@ -127,7 +132,7 @@ def fill_voxels(blob, low, side, bricks, octets, bases, planes, surfels, extras)
                     elif state < 0:
                         state = box_state(blob, ints, tab, x, y, z, 0.5 * side, nodes, stack, q, e)
                 if state != MIXED:
-                    byte = IN_BYTE if state == IN else OUT_BYTE
+                    byte = IN_BYTE if state == IN else OUT_BYTE  # a leap of 1
                 octets[n, 16 * (i + i1) + 4 * (j + j1) + k + k1] = byte
     return used, extra
 
@@ -174,6 +179,43 @@ def fill_octant(states, octant, out):
                 out[i, j, k] = state * (max(best, 0) + 1)
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def state_voxels(bricks, octets, out):
+    """Fill out (4·nx, 4·ny, 4·nz) int8 of bricks (nx, ny, nz) int8: 1 inside, −1 outside, 0 neither.
+
+    octets: (n, 64) bytes of the bricks that are 0, in their order.
+    """
+    slot = -1
+    for bi in range(bricks.shape[0]):
+        for bj in range(bricks.shape[1]):
+            for bk in range(bricks.shape[2]):
+                state = bricks[bi, bj, bk]
+                slot += 1 if state == 0 else 0
+                for v in range(64):
+                    if bricks[bi, bj, bk] == 0:
+                        byte = octets[slot, v]
+                        state = 1 if byte == IN_BYTE else (-1 if byte == OUT_BYTE else 0)
+                    out[BRICK * bi + (v >> 4), BRICK * bj + ((v >> 2) & 3), BRICK * bk + (v & 3)] = state
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_bytes(bricks, leaps, octets, out):
+    """Fill out (n, 64) bytes with the leaps (4·nx, 4·ny, 4·nz) int8 of one octant; the rest as `state_voxels`."""
+    slot = 0
+    for bi in range(bricks.shape[0]):
+        for bj in range(bricks.shape[1]):
+            for bk in range(bricks.shape[2]):
+                if bricks[bi, bj, bk] != 0:
+                    continue
+                for v in range(64):
+                    byte = np.int64(octets[slot, v])
+                    leap = np.int64(leaps[BRICK * bi + (v >> 4), BRICK * bj + ((v >> 2) & 3), BRICK * bk + (v & 3)])
+                    if byte > NO_SURFEL:
+                        byte += min(abs(leap), FARTHEST) - 1
+                    out[slot, v] = byte
+                slot += 1
+
+
 @inlined
 def voxel_state(blob, ints, tab, octets, words, x, y, z):
     """Return 1 inside, −1 outside, 0 not proven, of a point of the tree's frame, by its voxel and its surfel.
@@ -196,7 +238,7 @@ def voxel_state(blob, ints, tab, octets, words, x, y, z):
         return -1 if level > 0.0 else 1
     byte = octets[ints[c + BYTES] + 64 * slot + (((i & 3) << 4) | ((j & 3) << 2) | (k & 3))]
     if byte > NO_SURFEL:
-        return 1 if byte == IN_BYTE else -1
+        return 1 if byte < OUT_BYTE else -1
     if byte == NO_SURFEL:
         return 0
     number = words[ints[c + BASES] + slot] + byte

@@ -1,8 +1,8 @@
 """A segment's walk through the voxels: leaps over what is proven, planes at the surface, runs of what is left.
 
 A run is a stretch that no plane decides. Where the planes prove F monotone along it, it holds one crossing if the
-states at its ends differ and none else; where they only bound its bend, parabolas settle it; where a cut, a band or
-a retained part is near, the stretch is clipped down the tree.
+states at its ends differ and none else; where they do not, the cells of the leaf's chart settle it; where a cut, a band
+or a retained part is near, the stretch is clipped down the tree.
 """
 
 import math
@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from hhsr.kernels.cell import leaf_implicit
+from hhsr.kernels.chart_walk import follow_cells
 from hhsr.kernels.clipped import follow_tree, merge_touches
 from hhsr.kernels.layout import (
     FRAME,
@@ -22,7 +23,7 @@ from hhsr.kernels.layout import (
     VOXEL_FRAME,
     VOXELS,
 )
-from hhsr.kernels.stretch import PIECES, change, root_in, settle_stretch
+from hhsr.kernels.stretch import PIECES, change, root_in
 from hhsr.kernels.surfel import BEND, DETAIL_SIZE, EXTRA, OFFSET, PLANE_SIZE, SURFEL_OWNER, THICK, TURN
 from hhsr.kernels.tree import into_leaf, turn_into_leaf
 from hhsr.kernels.unmanaged import inlined, unmanaged
@@ -33,9 +34,10 @@ from hhsr.kernels.voxels import (
     BRICKS,
     BYTES,
     DETAILS,
-    IN_BYTE,
     LEAPS,
     NO_SURFEL,
+    OCTANT_BYTES,
+    OUT_BYTE,
     PLANES,
     solid_contains,
 )
@@ -43,7 +45,7 @@ from hhsr.kernels.voxels import (
 NUDGE = 1e-7  # mm (and voxels) past a voxel's border: less than voxels and planes are proven beyond theirs
 STILL = 1e-12  # voxels: along an axis, a segment that moves less stays where it is
 UNKNOWN = 2
-NONE, MONOTONE, BENT, CLIPPED = 0, 1, 2, 3  # kinds of runs: what is proven along one
+NONE, MONOTONE, OWN, CLIPPED = 0, 1, 2, 3  # kinds of runs: F is proven monotone; one leaf's; anybody's
 # A run, in the last row of the scratch: from which t, its owner, the sign of dF/dt, the least and greatest |dF/dt|,
 # |d²F/dt²|, and where F is about 1.
 RUN, RUN_START, RUN_OWNER, RUN_SIGN, RUN_LEAST, RUN_MOST, RUN_BEND, RUN_GUESS = PIECES, 0, 1, 2, 3, 4, 5, 6
@@ -69,16 +71,15 @@ def _close_run(
     px, py, pz = into_leaf(blob, ints, leaf, px, py, pz)
     if ints[leaf + ROTATED] != 0:
         dx, dy, dz = turn_into_leaf(blob, ints[leaf + FRAME], dx, dy, dz)
-    bend = work[RUN, RUN_BEND]
     if kind == MONOTONE:
         end = root_in(
             blob, ints, leaf, px, py, pz, dx, dy, dz, begin, end, work[RUN, RUN_GUESS], work[RUN, RUN_SIGN] > 0.0,
-            work[RUN, RUN_LEAST], work[RUN, RUN_MOST], bend, tolerance / length,
+            work[RUN, RUN_LEAST], work[RUN, RUN_MOST], work[RUN, RUN_BEND], tolerance / length,
         )  # fmt: skip
     else:
-        state, count = settle_stretch(
-            blob, ints, leaf, px, py, pz, dx, dy, dz, begin, end, bend, resolution / length, tolerance / length, gap,
-            state, out, count, work,
+        state, count = follow_cells(
+            blob, ints, tab, leaf, px, py, pz, dx, dy, dz, length, begin, end, resolution, tolerance, gap, state, out,
+            count, work,
         )  # fmt: skip
     return change(state, new, end, gap, out, count)
 
@@ -94,7 +95,7 @@ def _holds(blob, ints, owner, x, y, z):
 @inlined
 def _enter(kind, work, a, b, owner, slope, stray, bend, guess):
     """Add [a, b] of a voxel to the run, or begin one; return the run's kind. Owner −1: a voxel without a surfel."""
-    new = CLIPPED if owner < 0 else (MONOTONE if abs(slope) > stray else (BENT if bend < np.inf else CLIPPED))
+    new = CLIPPED if owner < 0 else (MONOTONE if abs(slope) > stray else OWN)
     if kind == NONE:
         work[RUN, RUN_START], work[RUN, RUN_OWNER], work[RUN, RUN_SIGN] = a, owner, slope
         work[RUN, RUN_LEAST], work[RUN, RUN_MOST] = abs(slope) - stray, abs(slope) + stray
@@ -109,7 +110,7 @@ def _enter(kind, work, a, b, owner, slope, stray, bend, guess):
         if guess >= a:  # the plane of this voxel is the one that the crossing lies on, or past
             work[RUN, RUN_GUESS] = guess
         return MONOTONE
-    return BENT if work[RUN, RUN_BEND] < np.inf else CLIPPED
+    return OWN
 
 
 @inlined
@@ -155,6 +156,7 @@ def follow_voxels(
     ox, oy, oz = (1 - sx) >> 1, (1 - sy) >> 1, (1 - sz) >> 1
     octant = (1 - ox) + 2 * (1 - oy) + 4 * (1 - oz)
     leaps = ints[c + LEAPS] + octant * (nx * ny * nz)
+    voxels += octant * ints[c + OCTANT_BYTES]
     nudge = max(NUDGE * min(1.0, blob[f + 3]) / length, 1e-15)
     speed = math.sqrt(vx * vx + vy * vy + vz * vz)
     t = start + nudge if start > 0.0 else 0.0
@@ -206,13 +208,15 @@ def follow_voxels(
                 ez = ((bk + sz + oz) << 2) * iz + kz
             else:
                 byte = np.int64(octets[voxels + 64 * slot + (((i & 3) << 4) | ((j & 3) << 2) | (k & 3))])
+                r = np.int64(1)
                 if byte > NO_SURFEL:
-                    known = 1 if byte == IN_BYTE else 0
+                    known = 1 if byte < OUT_BYTE else 0
+                    r = byte - (NO_SURFEL if byte < OUT_BYTE else OUT_BYTE - 1)
                 elif byte < NO_SURFEL:
                     surfel = np.int64(words[bases + slot]) + byte
-                ex = (i + sx + ox) * ix + kx
-                ey = (j + sy + oy) * iy + ky
-                ez = (k + sz + oz) * iz + kz
+                ex = (i + sx * r + ox) * ix + kx
+                ey = (j + sy * r + oy) * iy + ky
+                ez = (k + sz * r + oz) * iz + kz
         end = min(min(ex, ey), min(min(ez, near), stop))
         a, b, after, owner, cut = t, end, UNKNOWN, -1, False
         slope = stray = bend = guess = 0.0
@@ -256,7 +260,7 @@ def follow_voxels(
                 slope *= np.float64(tab[o + THICK])
                 stray, bend = speed * np.float64(tab[o + TURN]), speed * speed * np.float64(tab[o + BEND])
             # Beyond a cut the run, or the state before it, is another owner's: exact states part the two.
-            foreign = cut and (kind == MONOTONE or kind == BENT) and work[RUN, RUN_OWNER] != owner
+            foreign = cut and (kind == MONOTONE or kind == OWN) and work[RUN, RUN_OWNER] != owner
             if foreign or (cut and kind == NONE and known == UNKNOWN and last >= 0 and last != owner):
                 asked = int(work[RUN, RUN_OWNER]) if foreign else owner
                 holds = _holds(blob, ints, asked, px + t * dx, py + t * dy, pz + t * dz)

@@ -18,12 +18,12 @@ from hhsr.fitting.planes import settled
 from hhsr.fitting.refine import improved, misses, radii_of, view_of, weights_of
 from hhsr.fitting.samples import side_by_side, turned_fibonacci
 from hhsr.fitting.scale_field import NONE, fit_ellipsoid, grid_for, leaf_of, select_centres
-from hhsr.fitting.section import Section, section_of
+from hhsr.fitting.section import Section, near_voids, section_of
 from hhsr.fitting.solid import Solid, solid_of
 from hhsr.fitting.task import first_rows, start_rows, task_of
 from hhsr.fitting.threads import in_threads
 from hhsr.kernels.refinement import ellipsoid_radii
-from hhsr.model import Cut, ModelLeaf, ScaleField, frozen
+from hhsr.model import Cut, FloatArray, ModelLeaf, ScaleField, frozen, plane_frame
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +105,34 @@ def voids(section: Section, leaf: ModelLeaf) -> float:
     """The depths, summed, of the points of a leaf's sections that its centre sees and it does not cover."""
     void = (section.hit > section.reach) & (radii_of(leaf, section.along) < section.reach)
     return float(section.depth[void].sum())
+
+
+def test_a_void_between_the_points_of_a_section_is_found(solid: Solid) -> None:
+    parting = Parting(solid)
+    assert parting.grown(3)
+    piece = max(parting.pieces(3), key=lambda piece: len(section_of(solid, piece.region, piece.centre).reach))
+    coarse = section_of(solid, piece.region, piece.centre)
+    points = piece.centre + coarse.reach[:, None] * coarse.along
+    spacing = np.sqrt(coarse.cell[0])
+    deepest = int(np.argmax(coarse.depth * (coarse.hit > coarse.reach)))
+    plane = np.argmin(np.abs(piece.region.normals @ points[deepest] - piece.region.offsets))
+    frame = plane_frame(piece.region.normals[plane])
+    spot, wide = points[deepest] + 0.4 * spacing * (frame[0] + frame[1]), 0.25 * spacing
+
+    def radii(along: FloatArray) -> FloatArray:
+        """Longer than the planes' distance but near the spot, where a void as narrow as this is left."""
+        reach = piece.region.exits(piece.centre, along)[0]
+        away = np.linalg.norm(piece.centre + np.minimum(reach, 10.0)[:, None] * along - spot, axis=1)
+        return np.where(np.isfinite(reach), reach + np.minimum(away - wide, 0.2), 10.0)
+
+    assert (radii(coarse.along) >= coarse.reach).all()
+    near = near_voids(solid, piece.region, piece.centre, radii, 0.5 * coarse.depth[deepest])
+    found = piece.centre + near.reach[:, None] * near.along
+    void = radii(near.along) < near.reach
+    assert 0.5 * np.pi * wide**2 < near.cell[void].sum() < 2.0 * np.pi * wide**2
+    assert np.linalg.norm(found[void] - spot, axis=1).max() <= wide * (1.0 + 1e-6)
+    assert near.depth.min() > 0.45 * coarse.depth[deepest]
+    assert near_voids(solid, piece.region, piece.centre, radii, 2.0 * coarse.depth[deepest]).reach.size == 0
 
 
 def test_voids_behind_cuts_are_closed_and_never_made(solid: Solid) -> None:

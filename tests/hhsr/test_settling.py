@@ -80,12 +80,18 @@ def test_second_derivatives_are_exact_and_change_no_more_than_proven(one: ModelL
         if not np.isfinite(third):
             continue
         # Not on the cell's border: the half axes, and with them ∂²W, may change there.
+        last = None
         for u, v in np.concatenate([rng.uniform(-1, 1, (20, 2)), [[1, 1], [-1, 1], [1, 0], [0, -1]]]) * (0.9999 * half):
-            other = inverse_radius_bend(blob, ints, record, face, a + u, b + v)
+            other = np.array(inverse_radius_bend(blob, ints, record, face, a + u, b + v))
             if other[0] == 0.0:
                 continue
             change = np.linalg.norm([[other[3] - waa, other[4] - wab], [other[4] - wab, other[5] - wbb]], 2)
             assert change <= kink + third * np.hypot(u, v) + 1e-9 * w
+            if last is not None:  # between any two points it may change twice as fast
+                rest = other - last[0]
+                change = np.linalg.norm([[rest[3], rest[4]], [rest[4], rest[5]]], 2)
+                assert change <= 2.0 * (kink + third * np.hypot(*(np.array([u, v]) - last[1]))) + 1e-9 * w
+            last = other, np.array([u, v])
             seen += 1
     assert seen > 200
 

@@ -104,6 +104,43 @@ def test_a_plane_holds_all_over_its_voxel(depth: int, seed: int) -> None:
     assert bent > 0 or depth == 0  # a single leaf may have exponents, which bound no bend
 
 
+@pytest.mark.parametrize(("depth", "seed"), [(0, 0), (2, 2)])
+def test_nothing_changes_in_the_cube_of_a_leap(depth: int, seed: int) -> None:
+    grid = Grid(Shape(random_tree(seed, depth)))
+    mixed = np.argwhere(grid.slots >= 0)
+    stride = int(grid.record[grid_at.OCTANT_BYTES])
+    assert stride == 64 * len(mixed)
+    first = grid.octets[:stride].astype(int).reshape(-1, 4, 4, 4)
+    states = np.where(first < grid_at.IN_BYTE, 0, np.where(first < grid_at.OUT_BYTE, 1, -1))
+    whole = np.where(grid.slots == grid_at.INSIDE_BRICK, 1, -1).repeat(4, 0).repeat(4, 1).repeat(4, 2)
+    for brick in mixed:
+        i, j, k = 4 * brick
+        whole[i : i + 4, j : j + 4, k : k + 4] = states[grid.slots[tuple(brick)]]
+    longest = 0
+    for octant in range(8):
+        octets = grid.octets[octant * stride :][:stride].astype(int).reshape(-1, 4, 4, 4)
+        assert np.array_equal(octets < grid_at.IN_BYTE, first < grid_at.IN_BYTE)
+        ways = [1 if octant >> axis & 1 else -1 for axis in range(3)]
+        for brick in mixed[:: max(1, len(mixed) // 60)]:
+            for place in np.ndindex(4, 4, 4):
+                byte = octets[(grid.slots[tuple(brick)], *place)]
+                if byte < grid_at.IN_BYTE:
+                    continue
+                state = 1 if byte < grid_at.OUT_BYTE else -1
+                leap = byte - (grid_at.IN_BYTE if state > 0 else grid_at.OUT_BYTE) + 1
+                at_voxel = 4 * brick + place
+                cube = whole[
+                    tuple(
+                        slice(max(i - leap + 1, 0), i + 1) if way < 0 else slice(i, i + leap)
+                        for i, way in zip(at_voxel, ways, strict=True)
+                    )
+                ]
+                assert (cube == state).all()
+                assert state < 0 or cube.size == leap**3  # beyond the grid all is outside
+                longest = max(longest, leap)
+    assert longest > 3
+
+
 def border_points(shape: Shape, rng: np.random.Generator, count: int) -> np.ndarray:
     """Return LPS points on the borders, edges and corners of voxels near the surface, to the last bit of the grid."""
     grid = Grid(shape)
