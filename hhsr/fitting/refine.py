@@ -195,22 +195,9 @@ def _own_misses(
     normals, offsets = task.region
     least, area = 1e-6 * solid.size, ray_share(solid, RAYS)
     own_misses(
-        boxes,
-        links,
-        corners,
-        normals,
-        offsets,
-        leaf.centre,
-        task.free,
-        radius,
-        GRAZING,
-        least,
-        area,
-        miss,
-        slope,
-        share,
-        nearest,
-    )
+        boxes, links, corners, normals, offsets, leaf.centre, task.free, radius, GRAZING, least, area, miss, slope,
+        share, nearest,
+    )  # fmt: skip
 
 
 def _change(task: Task, found: Misses, weight: FloatArray, leaf: ModelLeaf, view: View) -> FloatArray:

@@ -44,25 +44,9 @@ def follow_segment(
     gap = MERGE / length
     if root == 0 and ints[VOXELS] != 0:
         return follow_voxels(
-            blob,
-            ints,
-            tab,
-            px,
-            py,
-            pz,
-            ex,
-            ey,
-            ez,
-            length,
-            gap,
-            resolution,
-            tolerance,
-            first,
-            out,
-            work,
-            slots,
+            blob, ints, tab, px, py, pz, ex, ey, ez, length, gap, resolution, tolerance, first, out, work, slots,
             pending,
-        )
+        )  # fmt: skip
     begin = solid_contains(blob, ints, tab, root, px, py, pz)
     state, count, done = follow_tree(
         blob, ints, tab, root, px, py, pz, dx, dy, dz, 0.0, 1.0, gap, resolution, tolerance, first, begin, out,
@@ -90,24 +74,9 @@ def cross_many(blob, starts, ends, resolution, tolerance, counts, begins, ts):
         px, py, pz = into_tree(blob, ints, starts[i, 0], starts[i, 1], starts[i, 2])
         ex, ey, ez = into_tree(blob, ints, ends[i, 0], ends[i, 1], ends[i, 2])
         begins[i], count = follow_segment(
-            blob,
-            ints,
-            tab,
-            np.int64(0),
-            px,
-            py,
-            pz,
-            ex,
-            ey,
-            ez,
-            resolution,
-            tolerance,
-            np.bool_(False),
-            ts[used:],
-            work,
-            slots,
-            pending,
-        )
+            blob, ints, tab, np.int64(0), px, py, pz, ex, ey, ez, resolution, tolerance, np.bool_(False), ts[used:],
+            work, slots, pending,
+        )  # fmt: skip
         if count > ts.shape[0] - used:
             return i, used
         counts[i] = count
@@ -140,24 +109,9 @@ def cross_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance, offsets, t, p
     px, py, pz = into_tree(blob, ints, ax, ay, az)
     ex, ey, ez = into_tree(blob, ints, bx, by, bz)
     inside, count = follow_segment(
-        blob,
-        ints,
-        tab,
-        np.int64(0),
-        px,
-        py,
-        pz,
-        ex,
-        ey,
-        ez,
-        resolution,
-        tolerance,
-        np.bool_(False),
-        t,
-        work,
-        slots,
+        blob, ints, tab, np.int64(0), px, py, pz, ex, ey, ez, resolution, tolerance, np.bool_(False), t, work, slots,
         pending,
-    )
+    )  # fmt: skip
     if count > t.shape[0]:
         return -1
     offsets[0], offsets[1] = 0, count
@@ -181,24 +135,9 @@ def first_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance):
     px, py, pz = into_tree(blob, ints, ax, ay, az)
     ex, ey, ez = into_tree(blob, ints, bx, by, bz)
     _, count = follow_segment(
-        blob,
-        ints,
-        tab,
-        np.int64(0),
-        px,
-        py,
-        pz,
-        ex,
-        ey,
-        ez,
-        resolution,
-        tolerance,
-        np.bool_(True),
-        t,
-        work,
-        slots,
+        blob, ints, tab, np.int64(0), px, py, pz, ex, ey, ez, resolution, tolerance, np.bool_(True), t, work, slots,
         pending,
-    )
+    )  # fmt: skip
     return t[0] if count > 0 else np.nan
 
 
@@ -235,24 +174,9 @@ def first_many(blob, starts, ends, resolution, tolerance, out):
         px, py, pz = into_tree(blob, ints, starts[i, 0], starts[i, 1], starts[i, 2])
         ex, ey, ez = into_tree(blob, ints, ends[i, 0], ends[i, 1], ends[i, 2])
         _, count = follow_segment(
-            blob,
-            ints,
-            tab,
-            np.int64(0),
-            px,
-            py,
-            pz,
-            ex,
-            ey,
-            ez,
-            resolution,
-            tolerance,
-            np.bool_(True),
-            t,
-            work,
-            slots,
-            pending,
-        )
+            blob, ints, tab, np.int64(0), px, py, pz, ex, ey, ez, resolution, tolerance, np.bool_(True), t, work,
+            slots, pending,
+        )  # fmt: skip
         out[i] = t[0] if count > 0 else np.nan
     return bad
 

@@ -137,18 +137,9 @@ def cell_bound(blob, ints, leaf, planes, count, search, face, a, b, half, value,
         if size == 0:
             return np.inf
     distance, _, x, y, z = polygon_to_segment(
-        corners,
-        size,
-        gx,
-        gy,
-        gz,
-        search[START],
-        search[START + 1],
-        search[START + 2],
-        search[VECTOR],
-        search[VECTOR + 1],
-        search[VECTOR + 2],
-    )
+        corners, size, gx, gy, gz, search[START], search[START + 1], search[START + 2], search[VECTOR],
+        search[VECTOR + 1], search[VECTOR + 2],
+    )  # fmt: skip
     if search[LENGTH2] == 0.0:
         # Across the plane the surface strays by `thick`, within it by no more than `slant`.
         aside = math.sqrt(max(distance * distance - along * along, 0.0)) - slant

@@ -166,27 +166,9 @@ def leaf_crossings(
         else:
             face = 4 if z >= 0.0 else 5
         state, count = face_crossings(
-            blob,
-            ints,
-            tab,
-            leaf,
-            face,
-            px,
-            py,
-            pz,
-            dx,
-            dy,
-            dz,
-            ta,
-            tb,
-            speed,
-            resolution,
-            tolerance,
-            state,
-            out,
-            count,
-            work,
-        )
+            blob, ints, tab, leaf, face, px, py, pz, dx, dy, dz, ta, tb, speed, resolution, tolerance, state, out,
+            count, work,
+        )  # fmt: skip
     if b < t1:
         state, count = emit(state, False, b, out, count)
     return state, count
@@ -315,24 +297,9 @@ def _settle(
         state, count = emit(state, g0 >= 0.0, t0, out, count)
         if (g0 >= 0.0) != (g1 >= 0.0):
             x = solve_in_cell(
-                blob,
-                ints,
-                leaf,
-                face,
-                a0,
-                b0,
-                w0,
-                a1,
-                b1,
-                w1,
-                x0,
-                x1,
-                g0,
-                g1,
-                slope,
-                2.0 * abs(rise) - slope,
+                blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, x0, x1, g0, g1, slope, 2.0 * abs(rise) - slope,
                 tolerance / max(length, 1e-12),
-            )
+            )  # fmt: skip
             state, count = emit(state, g1 >= 0.0, share_to_t(x, t0, t1, w0, w1), out, count)
         return 3, state, count
     if last and length <= resolution:
@@ -341,24 +308,9 @@ def _settle(
         state, count = emit(state, g0 >= 0.0, t0, out, count)
         if (g0 >= 0.0) != (g1 >= 0.0):
             x = solve_in_cell(
-                blob,
-                ints,
-                leaf,
-                face,
-                a0,
-                b0,
-                w0,
-                a1,
-                b1,
-                w1,
-                0.0,
-                1.0,
-                g0,
-                g1,
-                0.0,
-                math.inf,
+                blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, 0.0, 1.0, g0, g1, 0.0, math.inf,
                 tolerance / max(length, 1e-12),
-            )
+            )  # fmt: skip
             state, count = emit(state, g1 >= 0.0, share_to_t(x, t0, t1, w0, w1), out, count)
         return 3, state, count
     return UNDECIDED, state, count
