@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from threading import Lock, local
 from typing import Any
 
 import numba
@@ -14,6 +15,27 @@ from numpy.typing import NDArray
 from hhsr.model import FloatArray
 
 PARTS_PER_THREAD = 4
+_POOLS: dict[int, ThreadPoolExecutor] = {}
+_OPENING = Lock()
+_THREAD = local()
+
+
+def _forget() -> None:
+    """Begin anew in a forked child."""
+    _POOLS.clear()
+    _OPENING.release()
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows; a child has no threads but its own
+    os.register_at_fork(before=_OPENING.acquire, after_in_parent=_OPENING.release, after_in_child=_forget)
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Return the pool of so many threads, kept: to start them takes as long as 5,000 points."""
+    with _OPENING:
+        if threads not in _POOLS:
+            _POOLS[threads] = ThreadPoolExecutor(threads, "hhsr", lambda: setattr(_THREAD, "busy", True))
+        return _POOLS[threads]
 
 
 def in_parts(count: int, smallest: int, work: Callable[[int, int], Any]) -> list[Any]:
@@ -22,27 +44,26 @@ def in_parts(count: int, smallest: int, work: Callable[[int, int], Any]) -> list
     Threads: `numba.get_num_threads()`, at most the machine's. A row's answer must not depend on its part.
     """
     threads = min(numba.get_num_threads(), os.cpu_count() or 1, count // max(smallest, 1))
-    if threads <= 1:
+    if threads <= 1 or getattr(_THREAD, "busy", False):  # a part's own parts: a thread that waits for them helps none
         return [work(0, count)]
     parts = PARTS_PER_THREAD * threads
     edges = [count * k // parts for k in range(parts + 1)]
-    with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(work, edges[:-1], edges[1:]))
+    return list(_pool(threads).map(work, edges[:-1], edges[1:]))
 
 
 def neighbours_first(points: FloatArray) -> NDArray[np.int64]:
     """Return an order of points (n, 3) in which neighbours follow each other: they read the same tables.
 
-    Along Morton's curve over the box of the finite ones, 1,024 cells a side.
+    Along Morton's curve over the box of the finite ones, 32 cells a side: 15 bits are sorted in passes, not compared.
     """
     finite = np.isfinite(points)
     low = np.min(points, axis=0, where=finite, initial=np.inf)
     extent = np.max(points, axis=0, where=finite, initial=-np.inf) - low
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        share = (points - low) * (1023.0 / np.maximum(extent, 1e-300))
-    cell = np.where(finite, np.clip(np.nan_to_num(share), 0.0, 1023.0), 0.0).astype(np.int64)
-    for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
-        cell = (cell | (cell << shift)) & mask
+        share = (points - low) * (31.0 / np.maximum(extent, 1e-300))
+    cell = np.where(finite, np.clip(np.nan_to_num(share), 0.0, 31.0), 0.0).astype(np.uint16)
+    for shift, mask in ((8, 0x100F), (4, 0x10C3), (2, 0x1249)):
+        cell = (cell | (cell << np.uint16(shift))) & np.uint16(mask)
     return np.argsort(cell[:, 0] << 2 | cell[:, 1] << 1 | cell[:, 2], kind="stable")
 
 
