@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 RECIPE = 5  # raise when the same options should be fitted anew
 _HHSR = "from hhsr.cli import app; app()"  # the command by this interpreter, wherever its script lies
+# It imports what this process imports: by itself an interpreter would look into the folder that it is called from first.
+_SAME_PATH = "import sys; sys.path[:] = {!r}; "
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class _Commands:
 
     def run(self, *words: str) -> tuple[int, list[str]]:
         """Run a command by this interpreter; return its exit code and the lines of what it said."""
-        command = [sys.executable, "-c", _HHSR, *words]
+        command = [sys.executable, "-c", _SAME_PATH.format(sys.path) + _HHSR, *words]
         with self._lock:
             if self._stopped:
                 return 1, ["stopped before it began"]

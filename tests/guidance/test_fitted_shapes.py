@@ -19,6 +19,15 @@ def test_a_command_says_how_it_ended(tmp_path: Path) -> None:
     assert "none.hhsr" in " ".join(said)
 
 
+def test_a_command_runs_the_package_that_runs_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "hhsr").mkdir()
+    (tmp_path / "hhsr" / "__init__.py").write_text("raise ImportError('another hhsr, in the folder one stands in')")
+    monkeypatch.chdir(tmp_path)
+    code, said = _Commands().run("--help")
+    assert code == 0, said
+    assert any("warm-up" in line for line in said)
+
+
 def test_stopped_commands_end_and_none_begins(monkeypatch: pytest.MonkeyPatch) -> None:
     ended: list[int] = []
     commands = _Commands()
