@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hhsr.batches import in_parts
 from hhsr.check import as_points, require_finite
 from hhsr.errors import InputError
 from hhsr.kernels import triangles as kernels
@@ -92,7 +90,7 @@ class TriangleTree:
         if len(self.arrays.order) == 0:
             distance[:], nearest[:], face[:] = np.inf, np.nan, -1
         else:
-            _in_parts(kernels.nearest_points, len(flat), self.arrays, (flat, distance, nearest, face))
+            _fill(kernels.nearest_points, len(flat), self.arrays, (flat, distance, nearest, face))
         return distance.reshape(shape), nearest.reshape(*shape, 3), face.reshape(shape)
 
     def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
@@ -100,7 +98,7 @@ class TriangleTree:
         shape, flat = _flat(points, "points")
         inside = np.empty(len(flat), dtype=np.bool_)
         boxes, links, corners, _ = self.arrays
-        _in_parts(kernels.inside_points, len(flat), (boxes, links, corners), (flat, inside))
+        _fill(kernels.inside_points, len(flat), (boxes, links, corners), (flat, inside))
         return inside.reshape(shape)
 
     def crossings(self, starts: ArrayLike, ends: ArrayLike) -> TriangleCrossings:
@@ -129,7 +127,7 @@ class TriangleTree:
         with np.errstate(divide="ignore", invalid="ignore"):
             limit = np.where(length > 0, np.minimum(max_t, 1.01 * reach / length + 1e-6), 0.0)
         t, face = np.empty(len(first)), np.empty(len(first), dtype=np.int64)
-        _in_parts(kernels.first_crossings, len(first), self.arrays, (first, first + limit[:, None] * along, t, face))
+        _fill(kernels.first_crossings, len(first), self.arrays, (first, first + limit[:, None] * along, t, face))
         return t * limit, face
 
 
@@ -146,14 +144,6 @@ def _pair(starts: ArrayLike, ends: ArrayLike) -> tuple[FloatArray, FloatArray]:
     return first, last
 
 
-def _in_parts(
-    kernel: Callable[..., None], count: int, tree: tuple[Any, ...], columns: tuple[NDArray[Any], ...]
-) -> None:
+def _fill(kernel: Callable[..., None], count: int, tree: tuple[Any, ...], columns: tuple[NDArray[Any], ...]) -> None:
     """Run a kernel that fills its last arguments row by row; on several threads where there are many rows."""
-    workers = min(numba.get_num_threads(), os.cpu_count() or 1)
-    if count < PARALLEL_ABOVE or workers == 1:
-        kernel(*tree, *columns)
-        return
-    edges = np.linspace(0, count, 4 * workers + 1).astype(int)
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(lambda i: kernel(*tree, *(c[edges[i] : edges[i + 1]] for c in columns)), range(len(edges) - 1)))
+    in_parts(count, PARALLEL_ABOVE // 2, lambda i, j: kernel(*tree, *(column[i:j] for column in columns)))

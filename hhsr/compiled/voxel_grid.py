@@ -39,13 +39,13 @@ def voxel_grid(blob: FloatArray, low: FloatArray, side: float, counts: np.ndarra
     leaps = np.empty((8, *states.shape), dtype=np.int8)
     for octant in range(8):
         voxel_at.fill_octant(states, octant, leaps[octant])
-    octants = _with_leaps(states, octets)
+    by_octant = _with_leaps(states, octets)
     slots = np.where(states > 0, voxel_at.INSIDE_BRICK, voxel_at.OUTSIDE_BRICK).astype(np.int32)
     slots[states == 0] = np.arange(len(mixed))
     start = len(blob)
     frame = np.array([*low, side, 1.0 / side])
     tables: list[np.ndarray] = [
-        frame, leaps, slots, bases, octants, planes[:, :DETAIL], surfels[:, :DETAIL], surfels[:, DETAIL:],
+        frame, leaps, slots, bases, by_octant, planes[:, :DETAIL], surfels[:, :DETAIL], surfels[:, DETAIL:],
     ]  # fmt: skip
     places = np.concatenate([[0], np.cumsum([-(-table.nbytes // 8) for table in tables])]) + start + voxel_at.VOXEL_INTS
     record = np.zeros(voxel_at.VOXEL_INTS, dtype=np.int64)

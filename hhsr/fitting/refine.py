@@ -86,8 +86,7 @@ def improved(
     """Return the leaf after some Gauss-Newton steps on its misses, as long as they fall, and its misses.
 
     view: of the task's directions. power: of the misses whose sum is to fall (2: least squares, 1: their mean). A step
-    that does not help is halved, twice at most. before: what a leaf like it missed, near the same
-    triangles.
+    that does not help is halved, twice at most. before: what a leaf like it missed, near the same triangles.
     """
     found = misses(task, solid, leaf, view, before)
     weight = weights_of(found, solid, power)

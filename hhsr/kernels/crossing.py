@@ -10,8 +10,7 @@ from numba import njit
 
 from hhsr.kernels.clipped import follow_tree, merge_touches
 from hhsr.kernels.layout import VOXELS, integers, tables
-from hhsr.kernels.segment import emit
-from hhsr.kernels.stretch import PIECES
+from hhsr.kernels.segment import PIECES, emit
 from hhsr.kernels.tree import into_tree
 from hhsr.kernels.unmanaged import unmanaged
 from hhsr.kernels.voxels import solid_contains

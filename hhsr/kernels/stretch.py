@@ -12,8 +12,6 @@ from hhsr.kernels.leaf import MAX_SCALE
 from hhsr.kernels.sphere_rbf import gaussian_along
 from hhsr.kernels.unmanaged import inlined, unmanaged
 
-PIECES = 64  # depth of the bisection
-
 
 @inlined
 def change(state, new, t, gap, out, count):

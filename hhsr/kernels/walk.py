@@ -23,7 +23,8 @@ from hhsr.kernels.layout import (
     VOXEL_FRAME,
     VOXELS,
 )
-from hhsr.kernels.stretch import PIECES, change, root_in
+from hhsr.kernels.segment import PIECES
+from hhsr.kernels.stretch import change, root_in
 from hhsr.kernels.surfel import BEND, DETAIL_SIZE, EXTRA, OFFSET, PLANE_SIZE, SURFEL_OWNER, THICK, TURN
 from hhsr.kernels.tree import into_leaf, turn_into_leaf
 from hhsr.kernels.unmanaged import inlined, unmanaged
