@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 RECIPE = 5  # raise when the same options should be fitted anew
 _HHSR = "from hhsr.cli import app; app()"  # the command by this interpreter, wherever its script lies
-# It imports what this process imports: by itself an interpreter would look into the folder that it is called from first.
+# It imports what this process imports: by itself an interpreter looks into the folder that it is called from first.
 _SAME_PATH = "import sys; sys.path[:] = {!r}; "
 
 
