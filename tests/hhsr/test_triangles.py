@@ -156,9 +156,9 @@ def test_first_hit_is_the_first_crossing(lumpy: trimesh.Trimesh) -> None:
 def test_threads_change_nothing(lumpy: trimesh.Trimesh, monkeypatch: pytest.MonkeyPatch) -> None:
     points = np.random.default_rng(5).uniform(-45, 45, (6000, 3))
     tree = TriangleTree(lumpy.vertices, lumpy.faces)
-    monkeypatch.setattr("hhsr.triangle_tree.numba.get_num_threads", lambda: 1)
+    monkeypatch.setattr("hhsr.batches.numba.get_num_threads", lambda: 1)
     one = tree.closest(points)[0], tree.contains(points)
-    monkeypatch.setattr("hhsr.triangle_tree.numba.get_num_threads", lambda: 2)
+    monkeypatch.setattr("hhsr.batches.numba.get_num_threads", lambda: 2)
     two = tree.closest(points)[0], tree.contains(points)
     np.testing.assert_array_equal(one[0], two[0])
     np.testing.assert_array_equal(one[1], two[1])
