@@ -13,7 +13,7 @@ from hhsr.model import FloatArray
 
 Float32Array = NDArray[np.float32]
 
-CELLS_TOTAL = 150_000  # 32 bytes each
+CELLS_TOTAL = 146_000  # 32 bytes each
 FINEST = 0.004  # mm: no cell is parted below this thickness
 SHRINKS = 8.0  # halving a cell divides its thickness by about this, while the remainder of the bound rules
 
@@ -32,7 +32,7 @@ def fill_leaf_maps(blob: FloatArray, blob_view: FloatArray, owners: list[Owner],
         first = np.concatenate([[0], np.cumsum(4 ** k.ravel())])
         start = int(record[at.PARTING])
         ints[start : start + thickness.size] = first[:-1] * 16 + 8 * (thickness.ravel() > 0) + k.ravel()
-        ranges, bends = 2 * pyramid_size(int(record[at.CELLS])), 2 * thickness.size
+        ranges, bends = 2 * pyramid_size(int(record[at.CELLS])), at.BEND_SIZE * thickness.size
         record[at.RANGE_TABLE], record[at.BEND_TABLE] = place, place + ranges
         record[at.CELL_TABLE] = place + ranges + bends
         table = np.empty(ranges + bends + at.CELL_SIZE * int(first[-1]), dtype=np.float32)
@@ -45,9 +45,9 @@ def fill_leaf_maps(blob: FloatArray, blob_view: FloatArray, owners: list[Owner],
             record = ints[owner.record : owner.record + at.LEAF_INT_SIZE]
             n, box, start = int(record[at.CELLS]), int(record[at.BOX]), int(record[at.PARTING])
             words = ints[start : start + thickness.size].reshape(thickness.shape)
-            ranges, bends = 2 * pyramid_size(n), 2 * thickness.size
+            ranges, bends = 2 * pyramid_size(n), at.BEND_SIZE * thickness.size
             cells = table[ranges + bends :].reshape(-1, at.CELL_SIZE)
-            bend = table[ranges : ranges + bends].reshape(6, n, n, 2)
+            bend = table[ranges : ranges + bends].reshape(6, n, n, at.BEND_SIZE)
             prove_cells(blob_view, owner.record, n, words, models, spans, cells, bend)
             fill_ranges(n, spans, table[:ranges].reshape(-1, 2), blob[box : box + 8])
 
@@ -60,7 +60,7 @@ def _base(
 ) -> tuple[Float32Array, FloatArray, FloatArray, Float32Array]:
     n = int(ints[owner.record + at.CELLS])
     models, spans = np.empty((6, n, n, at.CELL_SIZE), dtype=np.float32), np.empty((6, n, n, 2))
-    thickness, bends = np.empty((6, n, n)), np.empty((6, n, n, 2), dtype=np.float32)
+    thickness, bends = np.empty((6, n, n)), np.empty((6, n, n, at.BEND_SIZE), dtype=np.float32)
     prove_base(blob_view, owner.record, n, owner.planes_at, len(owner.planes), models, spans, thickness, bends)
     return models, spans, thickness, bends
 

@@ -138,7 +138,7 @@ def _nearest_step(blob, ints, tab, search):
 
 
 @unmanaged
-def _by_chart(blob, ints, tab, search, local):
+def _by_chart(blob, ints, tab, search, local, spare):
     """Offer the foot of a point in the chart of its own leaf; return whether that is proven to be the nearest."""
     px, py, pz = search[START], search[START + 1], search[START + 2]
     owner = owner_of(blob, ints, 0, px, py, pz)
@@ -147,11 +147,10 @@ def _by_chart(blob, ints, tab, search, local):
         return False
     leaf = ints[o + OWNER_RECORD]
     px, py, pz = into_leaf(blob, ints, leaf, px, py, pz)
-    foot = local[FOOT : FOOT + 3]
-    distance, proven = foot_in_chart(blob, ints, tab, owner, px, py, pz, search[TOLERANCE], foot)
+    distance, proven = foot_in_chart(blob, ints, tab, owner, px, py, pz, search[TOLERANCE], local, spare)
     if distance < search[BEST]:
         frame = ints[leaf + FRAME]
-        x, y, z = turn_out_of_leaf(blob, frame, foot[0], foot[1], foot[2])
+        x, y, z = turn_out_of_leaf(blob, frame, local[FOOT], local[FOOT + 1], local[FOOT + 2])
         offer(search, distance, 0.0, x + blob[frame], y + blob[frame + 1], z + blob[frame + 2])
     return proven
 
@@ -159,7 +158,7 @@ def _by_chart(blob, ints, tab, search, local):
 @unmanaged
 def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects):
     """Find the surface point nearest to the search's segment, to its tolerance: truth ∈ [best − tolerance, best]."""
-    if search[LENGTH2] == 0.0 and _by_chart(blob, ints, tab, search, local):
+    if search[LENGTH2] == 0.0 and _by_chart(blob, ints, tab, search, local, spare):
         return
     nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
     _nearest_step(blob, ints, tab, search)

@@ -1,19 +1,20 @@
 """The foot of a point on one smooth leaf: Newton's steps on exact jets, and the proof that nothing lies nearer.
 
-At a point of contact x with the chart's second derivatives bounded by `bend`, the surface rises above the tangent
-plane at x by
-no more than κ/2 times the squared distance from x: so the ball of radius 1/κ that touches x from the point's side is
-free of surface, and with it every smaller ball inside it.
+At a point of contact x the surface rises towards the point by no more than κ/2 times the squared distance from x, where
+κ bounds the second derivatives of F = m·W over its gradient at x: so the ball of radius 1/κ that touches x from the
+point's side is free of surface, and with it every smaller ball inside it.
 """
 
 import math
 
 import numpy as np
 
-from hhsr.kernels.cell import chart_of, direction_of, face_of
-from hhsr.kernels.jet import has_jets, inverse_radius_jet
+from hhsr.kernels.box_state import directions_of, index_of
+from hhsr.kernels.cell import axis_scale, direction_of, face_of
+from hhsr.kernels.jet import has_jets, inverse_radius_bend, inverse_radius_jet
 from hhsr.kernels.layout import (
     CELLS,
+    HALF_AXES,
     MODEL,
     OWNER_INT_SIZE,
     OWNER_INTS,
@@ -21,8 +22,14 @@ from hhsr.kernels.layout import (
     OWNER_PLANE_FLOATS,
     OWNER_PLANES,
     OWNER_RECORD,
+    SLOPE_A,
+    SLOPE_B,
+    VALUE,
 )
-from hhsr.kernels.maps import bend_over, plane_of
+from hhsr.kernels.cell import chart_of
+from hhsr.kernels.maps import bend_over, cell_at, plane_of, rests_over
+from hhsr.kernels.patch import FOOT, LENGTH2, START, TOLERANCE
+from hhsr.kernels.quadratic import square_is_clear
 from hhsr.kernels.unmanaged import unmanaged
 
 STEPS = 5
@@ -30,58 +37,110 @@ WIDEST = 6  # base cells a side that a ball may cover
 
 
 @unmanaged
-def ball_is_free(px, py, pz, radius, face, a, b, way, w, ga, gb, bend_lo, bend_hi):
-    """Return whether no surface over a piece of a face lies nearer to a point than `radius`; all in the leaf's frame.
+def _bend(tab, ints, leaf, face, a_lo, a_hi, b_lo, b_hi, least_m, way):
+    """Return a bound of how F bends over directions of a face from least_m on: infinite where they are too many.
 
-    (w, ga, gb): exact jet at (a, b); way: the piece lies within that of (a, b), in a and in b. bend_lo, bend_hi: its
-    eigenvalues of ∂²W.
+    way: −1 where F must not bend down, 1 where not up.
     """
-    gx, gy, gz = plane_of(face, a, b, w, ga, gb)
-    g = math.sqrt(gx * gx + gy * gy + gz * gz)
-    height = (gx * px + gy * py + gz * pz - 1.0) / g
-    bend = max(-bend_lo, 0.0)
-    if height < 0.0:
-        height, bend = -height, max(bend_hi, 0.0)
-    # Over the piece: m·|W − plane|/|g| is the height, |δ|² ≤ (1 + a² + b²)/m² times the squared distance.
-    rise = (abs(ga) + abs(gb) + bend * way) * way
-    low, high = w - rise, w + rise
-    if not low > 0.25 * w:
-        return False
-    wide_a, wide_b = abs(a) + way, abs(b) + way
-    kappa = bend * (1.0 + wide_a * wide_a + wide_b * wide_b) * high * high / (low * g) * (1.0 + 1e-9)
-    x, y, z = direction_of(face, a, b)
-    rx, ry, rz = px - x / w, py - y / w, pz - z / w
-    away2 = rx * rx + ry * ry + rz * rz
-    return kappa * radius < 1.0 and kappa * (away2 - radius * radius) <= 2.0 * (height - radius)
+    n = ints[leaf + CELLS]
+    i0, i1, j0, j1 = index_of(a_lo, n), index_of(a_hi, n), index_of(b_lo, n), index_of(b_hi, n)
+    if i1 - i0 >= WIDEST or j1 - j0 >= WIDEST:
+        return np.inf
+    bend_lo, bend_hi = bend_over(tab, ints, leaf, face, i0, i1, j0, j1)
+    far_a, far_b = max(abs(a_lo), abs(a_hi)), max(abs(b_lo), abs(b_hi))
+    # The second derivative of F along v is that of W along v − (a, b)·v_m, over m.
+    return max(-bend_lo if way < 0 else bend_hi, 0.0) * (1.0 + far_a * far_a + far_b * far_b) / least_m * (1.0 + 1e-9)
 
 
 @unmanaged
-def step_to_foot(px, py, pz, face, a, b, w, ga, gb):
-    """Return (a, b, m) of the foot of a point on a jet's plane, the next contact; m ≤ 0 where there is none."""
+def _bend_beyond(tab, ints, leaf, radius, way, q, e):
+    """Return `_bend` of a ball that lies on several faces. q: (3,) its centre; e: (3,) scratch."""
+    e[0] = e[1] = e[2] = radius * (1.0 + 1e-9)
+    most = 0.0
+    for face in range(6):
+        m_lo, m_hi, a_lo, a_hi, b_lo, b_hi = directions_of(face, q, e)
+        if m_hi > 0.0:
+            most = max(most, _bend(tab, ints, leaf, face, a_lo, a_hi, b_lo, b_hi, m_lo, way))
+    return most
+
+
+@unmanaged
+def jump_over(blob, ints, leaf, face, a, b, half, w):
+    """Return a bound of how far ∂²W jumps where the half axes change sides within a square about (a, b).
+
+    w: W there, of which it may be half as much again over the square.
+    """
+    h = ints[leaf + HALF_AXES]
+    axis = face // 2
+    most = 0.0
+    for k in range(2):
+        if abs(a if k == 0 else b) <= half:
+            minor = 2 * ((axis + 1 + k) % 3)
+            most += abs(axis_scale(blob, h, minor, 1.0) - axis_scale(blob, h, minor, -1.0))
+    # ∂²N jumps by that over N; W = N·D, and N² is no less than the major axis' part of it.
+    return 1.5 * w * most / axis_scale(blob, h, 2 * axis, 1.0 if face % 2 == 0 else -1.0)
+
+
+@unmanaged
+def _square_is_free(blob, ints, tab, leaf, local, radius, face, a, b, half):
+    """Return whether no surface over the square about (a, b) lies nearer to the search's point: by the jet there."""
+    if max(abs(a), abs(b)) + half > 1.0:
+        return False
+    n = ints[leaf + CELLS]
+    kink, third = rests_over(
+        tab, ints, leaf, face, index_of(a - half, n), index_of(a + half, n), index_of(b - half, n),
+        index_of(b + half, n),
+    )  # fmt: skip
+    if not third < np.inf:
+        return False
+    w, wa, wb, waa, wab, wbb = inverse_radius_bend(blob, ints, leaf, face, a, b)
+    if w == 0.0:
+        return False
+    kink += jump_over(blob, ints, leaf, face, a, b, half, w)
+    local[LENGTH2] = 0.0
+    clear, _, _ = square_is_clear(local, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third)
+    return clear
+
+
+@unmanaged
+def _step(px, py, pz, face, a, b, w, ga, gb):
+    """Return (a, b, m) of the foot of a point on a plane of W, the next contact; m ≤ 0 where there is none."""
     gx, gy, gz = plane_of(face, a, b, w, ga, gb)
     h = (gx * px + gy * py + gz * pz - 1.0) / (gx * gx + gy * gy + gz * gz)
     return chart_of(face, px - h * gx, py - h * gy, pz - h * gz)
 
 
 @unmanaged
-def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, foot):
+def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, local, spare):
     """Return (distance, proven) of a point of the owner's region (leaf's frame) to its own leaf along the point's
     chart.
 
-    foot: (3,) filled with the surface point at that distance, leaf frame. Distance is infinite where nothing was found
-    in the region. Proven: no surface of the whole solid lies nearer than the distance less the tolerance.
+    local: a search, whose FOOT is filled with the surface point at that distance, leaf frame. Distance is infinite
+    where nothing was found in the region, or nothing could be proven. Proven: no surface of the whole solid lies nearer
+    than the distance less the tolerance. spare: (ROOM, 3) scratch.
     """
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
     leaf = ints[o + OWNER_RECORD]
     if ints[o + OWNER_KIND] != MODEL or not has_jets(ints, leaf) or (px == 0.0 and py == 0.0 and pz == 0.0):
         return np.inf, False
     face, a, b, m = face_of(px, py, pz)
-    ca, cb, w, ga, gb, last = a, b, 0.0, 0.0, 0.0, np.inf
+    planes, count = ints[o + OWNER_PLANE_FLOATS], ints[o + OWNER_PLANES]
+    gap = m
+    for k in range(count):
+        q = planes + 4 * k
+        gap = min(gap, blob[q + 3] - (blob[q] * px + blob[q + 1] * py + blob[q + 2] * pz))
+    # The first step is the table's.
+    c, ca, cb, _ = cell_at(ints, leaf, face, a, b)
+    w, ga, gb = np.float64(tab[c + VALUE]), np.float64(tab[c + SLOPE_A]), np.float64(tab[c + SLOPE_B])
+    ca, cb, nm = _step(px, py, pz, face, ca, cb, w, ga, gb)
+    last = max(abs(ca - a), abs(cb - b))
+    if not nm > 0.0 or abs(ca) > 1.0 or abs(cb) > 1.0:
+        return np.inf, False
     for _ in range(STEPS):
         w, ga, gb = inverse_radius_jet(blob, ints, leaf, face, ca, cb)
         if w == 0.0:
             return np.inf, False
-        na, nb, nm = step_to_foot(px, py, pz, face, ca, cb, w, ga, gb)
+        na, nb, nm = _step(px, py, pz, face, ca, cb, w, ga, gb)
         move = max(abs(na - ca), abs(nb - cb))
         if not nm > 0.0 or abs(na) > 1.0 or abs(nb) > 1.0 or move > 0.7 * last:
             break
@@ -95,31 +154,35 @@ def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, foot):
             return np.inf, False
     x, y, z = direction_of(face, ca, cb)
     x, y, z = x / w, y / w, z / w
-    foot[0], foot[1], foot[2] = x, y, z
-    distance = math.sqrt((px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2)
-    planes = ints[o + OWNER_PLANE_FLOATS]
-    gap = np.inf
-    for k in range(ints[o + OWNER_PLANES]):
+    local[FOOT], local[FOOT + 1], local[FOOT + 2] = x, y, z
+    rx, ry, rz = px - x, py - y, pz - z
+    away2 = rx * rx + ry * ry + rz * rz
+    distance = math.sqrt(away2)
+    for k in range(count):
         q = planes + 4 * k
-        gap = min(gap, blob[q + 3] - (blob[q] * px + blob[q + 1] * py + blob[q + 2] * pz))
         if blob[q] * x + blob[q + 1] * y + blob[q + 2] * z > blob[q + 3] + 1e-9:
             return np.inf, False
     if gap <= distance or m <= 2.0 * distance:
         return distance, False
     if distance <= tolerance:
         return distance, True
+    radius = distance - tolerance
+    gx, gy, gz = plane_of(face, ca, cb, w, ga, gb)
+    g = math.sqrt(gx * gx + gy * gy + gz * gz)
+    height = (gx * px + gy * py + gz * pz - 1.0) / g
+    local[START], local[START + 1], local[START + 2] = px, py, pz
+    way = -1 if height > 0.0 else 1
     # Directions of the ball: |a′ − a| ≤ R √(1 + a²)/(m − R).
     reach = distance / (m - distance) * (1.0 + 1e-9)
     reach_a, reach_b = reach * math.sqrt(1.0 + a * a), reach * math.sqrt(1.0 + b * b)
     if abs(a) + reach_a > 1.0 or abs(b) + reach_b > 1.0:
-        return distance, False
-    n = ints[leaf + CELLS]
-    i0, i1 = int((a - reach_a + 1.0) * 0.5 * n), min(int((a + reach_a + 1.0) * 0.5 * n), n - 1)
-    j0, j1 = int((b - reach_b + 1.0) * 0.5 * n), min(int((b + reach_b + 1.0) * 0.5 * n), n - 1)
-    if i1 - i0 >= WIDEST or j1 - j0 >= WIDEST:
-        return distance, False
-    bend_lo, bend_hi = bend_over(tab, ints, leaf, face, i0, i1, j0, j1)
-    if not (bend_lo > -np.inf and bend_hi < np.inf):
-        return distance, False
-    way = max(reach_a + abs(ca - a), reach_b + abs(cb - b))
-    return distance, ball_is_free(px, py, pz, distance - tolerance, face, ca, cb, way, w, ga, gb, bend_lo, bend_hi)
+        bend = _bend_beyond(tab, ints, leaf, distance, way, local, spare[0])
+    else:
+        bend = _bend(
+            tab, ints, leaf, face, a - reach_a, a + reach_a, b - reach_b, b + reach_b, m - distance, way
+        )  # fmt: skip
+    kappa = bend / g
+    if kappa * radius < 1.0 and kappa * (away2 - radius * radius) <= 2.0 * (abs(height) - radius):
+        return distance, True
+    half = max(reach_a + abs(ca - a), reach_b + abs(cb - b))
+    return distance, _square_is_free(blob, ints, tab, leaf, local, radius, face, ca, cb, half)

@@ -12,6 +12,7 @@ from numba import njit
 
 from hhsr.kernels.cell import cell_model, direction_of
 from hhsr.kernels.layout import (
+    BEND_SIZE,
     BEND_TABLE,
     BLOCK_ROWS,
     BLOCKS_PER_SIDE,
@@ -74,9 +75,24 @@ def bend_over(tab, ints, leaf, face, i0, i1, j0, j1):
     bend_lo, bend_hi = np.inf, -np.inf
     for i in range(i0, i1 + 1):
         for j in range(j0, j1 + 1):
-            q = ints[leaf + BEND_TABLE] + 2 * ((face * n + i) * n + j)
+            q = ints[leaf + BEND_TABLE] + BEND_SIZE * ((face * n + i) * n + j)
             bend_lo, bend_hi = min(bend_lo, np.float64(tab[q])), max(bend_hi, np.float64(tab[q + 1]))
     return bend_lo, bend_hi
+
+
+@unmanaged
+def rests_over(tab, ints, leaf, face, i0, i1, j0, j1):
+    """Return (kink, third): ∂²W at two points of base cells i0 … i1, j0 … j1 of a face differs by no more than
+    kink + third times their distance.
+    """
+    n = ints[leaf + CELLS]
+    kink = third = 0.0
+    for i in range(i0, i1 + 1):
+        for j in range(j0, j1 + 1):
+            q = ints[leaf + BEND_TABLE] + BEND_SIZE * ((face * n + i) * n + j)
+            kink, third = max(kink, np.float64(tab[q + 2])), max(third, np.float64(tab[q + 3]))
+    # A cell's are from its own middle: between two other points twice as much. A line passes so many of them.
+    return 2.0 * (i1 - i0 + j1 - j0 + 1) * kink, 2.0 * third
 
 
 @unmanaged
@@ -197,6 +213,7 @@ def prove_base(blob, leaf, n, planes, count, models, spans, thickness, bends):
                     blob, ints, leaf, face, a, b, half, half
                 )
                 _put_bend(bends, face, i, j, b0, b1)
+                bends[face, i, j, 2], bends[face, i, j, 3] = kink * UP, third * UP
                 _write(models[face, i, j], value, ga, gb, error, half, da, db, kink, third)
                 spans[face, i, j, 0], spans[face, i, j, 1] = lo, hi
                 x, y, z, radius = cell_sphere(face, a, b, half, half, value, ga, gb, error, lo, hi)

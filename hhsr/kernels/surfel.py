@@ -10,6 +10,7 @@ import numpy as np
 
 from hhsr.kernels.box_state import IN, MIXED, OUT, SLACK, directions_of, index_of, leaf_box_state
 from hhsr.kernels.layout import (
+    BEND_SIZE,
     BEND_TABLE,
     CELL_SIZE,
     CELL_TABLE,
@@ -77,7 +78,7 @@ def _scan(ints, tab, leaf, face, a_lo, a_hi, b_lo, b_hi, gx, gy, gz, gather, acc
             side = n * s
             half = 1.0 / side
             if not gather:
-                o = ints[leaf + BEND_TABLE] + 2 * ((face * n + i) * n + j)
+                o = ints[leaf + BEND_TABLE] + BEND_SIZE * ((face * n + i) * n + j)
                 acc[4] = max(acc[4], max(-tab[o], tab[o + 1]))
             p0, p1 = max(index_of(a_lo, side), i * s), min(index_of(a_hi, side), i * s + s - 1)
             q0, q1 = max(index_of(b_lo, side), j * s), min(index_of(b_hi, side), j * s + s - 1)
