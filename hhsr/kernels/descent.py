@@ -20,7 +20,7 @@ from hhsr.kernels.layout import (
     OWNER_RECORD,
 )
 from hhsr.kernels.maps import outside_region, plane_of
-from hhsr.kernels.patch import BEST, START, TOLERANCE, offer
+from hhsr.kernels.patch import BEST, START, TOLERANCE, offer, set_spot
 from hhsr.kernels.tree import into_leaf, owner_of, turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
 
@@ -58,6 +58,8 @@ def descend(blob, ints, owner, face, a, b, search):
         gg = gx * gx + gy * gy + gz * gz
         h = (gx * rx + gy * ry + gz * rz) / gg
         if within and distance - abs(h) * math.sqrt(gg) < 0.02 * search[TOLERANCE]:
+            if distance == search[BEST]:
+                set_spot(search, owner, face, a, b)
             return True
         # Newton: with B the second derivatives of m·W in space, (1 + h B) δ = what of q − x lies in the tangent plane,
         # for δ in it. In the chart δ = x_a δa + x_b δb, and x_i·B x_j = m W_ij.

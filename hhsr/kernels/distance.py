@@ -43,10 +43,12 @@ from hhsr.kernels.patch import (
     LENGTH2,
     NODE_ROOM,
     SEARCH_SIZE,
+    SPOT,
     START,
     TOLERANCE,
     VECTOR,
     offer,
+    set_spot,
 )
 from hhsr.kernels.polygon import ROOM, segment_to_segment
 from hhsr.kernels.tree import (
@@ -85,7 +87,7 @@ def set_search(search, px, py, pz, dx, dy, dz, tolerance):
     search[LENGTH2] = dx * dx + dy * dy + dz * dz
     search[BEST], search[BEST_T] = FAR, 0.0
     search[FOOT], search[FOOT + 1], search[FOOT + 2] = np.nan, np.nan, np.nan
-    search[TOLERANCE] = tolerance
+    search[TOLERANCE], search[SPOT] = tolerance, -1.0
 
 
 @unmanaged
@@ -152,6 +154,7 @@ def _by_chart(blob, ints, tab, search, local, spare):
         frame = ints[leaf + FRAME]
         x, y, z = turn_out_of_leaf(blob, frame, local[FOOT], local[FOOT + 1], local[FOOT + 2])
         offer(search, distance, 0.0, x + blob[frame], y + blob[frame + 1], z + blob[frame + 2])
+        set_spot(search, owner, local[SPOT + 1], local[SPOT + 2], local[SPOT + 3])
     return proven
 
 

@@ -28,7 +28,7 @@ from hhsr.kernels.layout import (
 )
 from hhsr.kernels.cell import chart_of
 from hhsr.kernels.maps import bend_over, cell_at, plane_of, rests_over
-from hhsr.kernels.patch import FOOT, LENGTH2, START, TOLERANCE
+from hhsr.kernels.patch import FOOT, LENGTH2, START, set_spot
 from hhsr.kernels.quadratic import square_is_clear
 from hhsr.kernels.unmanaged import unmanaged
 
@@ -82,8 +82,8 @@ def jump_over(blob, ints, leaf, face, a, b, half, w):
 
 
 @unmanaged
-def _square_is_free(blob, ints, tab, leaf, local, radius, face, a, b, half):
-    """Return whether no surface over the square about (a, b) lies nearer to the search's point: by the jet there."""
+def square_is_free(blob, ints, tab, leaf, local, radius, face, a, b, half):
+    """Return whether no surface over the square about (a, b) lies nearer to the search's segment: by the jet there."""
     if max(abs(a), abs(b)) + half > 1.0:
         return False
     n = ints[leaf + CELLS]
@@ -97,7 +97,6 @@ def _square_is_free(blob, ints, tab, leaf, local, radius, face, a, b, half):
     if w == 0.0:
         return False
     kink += jump_over(blob, ints, leaf, face, a, b, half, w)
-    local[LENGTH2] = 0.0
     clear, _, _ = square_is_clear(local, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third)
     return clear
 
@@ -155,6 +154,7 @@ def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, local, spare):
     x, y, z = direction_of(face, ca, cb)
     x, y, z = x / w, y / w, z / w
     local[FOOT], local[FOOT + 1], local[FOOT + 2] = x, y, z
+    set_spot(local, owner, face, ca, cb)
     rx, ry, rz = px - x, py - y, pz - z
     away2 = rx * rx + ry * ry + rz * rz
     distance = math.sqrt(away2)
@@ -185,4 +185,5 @@ def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, local, spare):
     if kappa * radius < 1.0 and kappa * (away2 - radius * radius) <= 2.0 * (abs(height) - radius):
         return distance, True
     half = max(reach_a + abs(ca - a), reach_b + abs(cb - b))
-    return distance, _square_is_free(blob, ints, tab, leaf, local, radius, face, ca, cb, half)
+    local[LENGTH2] = 0.0
+    return distance, square_is_free(blob, ints, tab, leaf, local, radius, face, ca, cb, half)

@@ -23,9 +23,10 @@ from hhsr.kernels.maps import (
 from hhsr.kernels.polygon import clip_polygon, polygon_to_segment
 from hhsr.kernels.unmanaged import unmanaged
 
-# Slots of a search: start 3, vector 3, squared length; best distance, t, point 3 (owner's frame); tolerance.
-START, VECTOR, LENGTH2, BEST, BEST_T, FOOT, TOLERANCE = 0, 3, 6, 7, 8, 9, 12
-SEARCH_SIZE = 16
+# Slots of a search: start 3, vector 3, squared length; best distance, t, point 3 (owner's frame); tolerance; and where
+# the best point is a foot, its spot: owner (−1: it is none), face, a, b.
+START, VECTOR, LENGTH2, BEST, BEST_T, FOOT, TOLERANCE, SPOT = 0, 3, 6, 7, 8, 9, 12, 13
+SEARCH_SIZE = 17
 LATE = 256  # room for pending nodes
 NODE_ROOM = 256  # room for facets to be settled, and for parts of one
 FAR = 1e150  # mm: no surface point found yet; finite, so that "no surface here" (infinite) is beyond it
@@ -48,8 +49,14 @@ def distance_to(search, x, y, z):
 def offer(search, distance, t, x, y, z):
     """Take a surface point as the best one if it is nearer."""
     if distance < search[BEST]:
-        search[BEST], search[BEST_T] = distance, t
+        search[BEST], search[BEST_T], search[SPOT] = distance, t, -1.0
         search[FOOT], search[FOOT + 1], search[FOOT + 2] = x, y, z
+
+
+@unmanaged
+def set_spot(search, owner, face, a, b):
+    """Note that a search's best point is a foot: that of an owner at (a, b) on a face."""
+    search[SPOT], search[SPOT + 1], search[SPOT + 2], search[SPOT + 3] = owner, face, a, b
 
 
 @unmanaged
