@@ -10,14 +10,14 @@ import math
 import numpy as np
 from numba import njit
 
+from hhsr.kernels.by_charts import nearest_by_charts
 from hhsr.kernels.crossing import follow_segment, scratch
 from hhsr.kernels.descent import descend_from
 from hhsr.kernels.discs import WIDE
-from hhsr.kernels.foot import foot_in_chart
+from hhsr.kernels.foot import FREE, UNPROVEN
 from hhsr.kernels.layout import (
     EDGE_COUNT,
     EDGE_FLOATS,
-    FRAME,
     MODEL,
     OWNER_BOX,
     OWNER_COUNT,
@@ -48,15 +48,11 @@ from hhsr.kernels.patch import (
     TOLERANCE,
     VECTOR,
     offer,
-    set_spot,
 )
 from hhsr.kernels.polygon import ROOM, segment_to_segment
 from hhsr.kernels.tree import (
-    into_leaf,
     into_tree,
     out_of_tree,
-    owner_of,
-    turn_out_of_leaf,
 )
 from hhsr.kernels.unmanaged import managed, unmanaged
 from hhsr.kernels.voxels import solid_contains
@@ -140,29 +136,14 @@ def _nearest_step(blob, ints, tab, search):
 
 
 @unmanaged
-def _by_chart(blob, ints, tab, search, local, spare):
-    """Offer the foot of a point in the chart of its own leaf; return whether that is proven to be the nearest."""
-    px, py, pz = search[START], search[START + 1], search[START + 2]
-    owner = owner_of(blob, ints, 0, px, py, pz)
-    o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
-    if ints[o + OWNER_KIND] != MODEL:
-        return False
-    leaf = ints[o + OWNER_RECORD]
-    px, py, pz = into_leaf(blob, ints, leaf, px, py, pz)
-    distance, proven = foot_in_chart(blob, ints, tab, owner, px, py, pz, search[TOLERANCE], local, spare)
-    if distance < search[BEST]:
-        frame = ints[leaf + FRAME]
-        x, y, z = turn_out_of_leaf(blob, frame, local[FOOT], local[FOOT + 1], local[FOOT + 2])
-        offer(search, distance, 0.0, x + blob[frame], y + blob[frame + 1], z + blob[frame + 2])
-        set_spot(search, owner, local[SPOT + 1], local[SPOT + 2], local[SPOT + 3])
-    return proven
-
-
-@unmanaged
 def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects):
     """Find the surface point nearest to the search's segment, to its tolerance: truth ∈ [best − tolerance, best]."""
-    if search[LENGTH2] == 0.0 and _by_chart(blob, ints, tab, search, local, spare):
-        return
+    if search[LENGTH2] == 0.0:
+        outcome = nearest_by_charts(blob, ints, tab, search, local, nodes, spare)
+        if outcome == FREE:
+            _nearest_step(blob, ints, tab, search)
+        if outcome != UNPROVEN:
+            return
     nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
     _nearest_step(blob, ints, tab, search)
     for owner in range(ints[OWNER_COUNT]):

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from hhsr.kernels.box_state import directions_of, index_of
-from hhsr.kernels.cell import axis_scale, direction_of, face_of
+from hhsr.kernels.cell import axis_scale, chart_of, direction_of, face_of
 from hhsr.kernels.jet import has_jets, inverse_radius_bend, inverse_radius_jet
 from hhsr.kernels.layout import (
     CELLS,
@@ -26,14 +26,16 @@ from hhsr.kernels.layout import (
     SLOPE_B,
     VALUE,
 )
-from hhsr.kernels.cell import chart_of
 from hhsr.kernels.maps import bend_over, cell_at, plane_of, rests_over
 from hhsr.kernels.patch import FOOT, LENGTH2, START, set_spot
 from hhsr.kernels.quadratic import square_is_clear
 from hhsr.kernels.unmanaged import unmanaged
 
 STEPS = 5
+CLOSE = 1.0  # tolerances: a foot this near to where the next step would go is one
 WIDEST = 6  # base cells a side that a ball may cover
+NEARBY = 0.1  # of the depth below its face: farther from a point a surface's own bends make many feet of one
+UNPROVEN, FREE, PROVEN = 0, 1, 2
 
 
 @unmanaged
@@ -110,80 +112,116 @@ def _step(px, py, pz, face, a, b, w, ga, gb):
 
 
 @unmanaged
-def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, local, spare):
-    """Return (distance, proven) of a point of the owner's region (leaf's frame) to its own leaf along the point's
-    chart.
+def _descend(blob, ints, tab, leaf, face, a, b, px, py, pz, tolerance):
+    """Return (found, a, b, w, wa, wb) of the foot of a point on a leaf's surface, with the jet there; all on one face.
 
-    local: a search, whose FOOT is filled with the surface point at that distance, leaf frame. Distance is infinite
-    where nothing was found in the region, or nothing could be proven. Proven: no surface of the whole solid lies nearer
-    than the distance less the tolerance. spare: (ROOM, 3) scratch.
+    (a, b): the point's own directions. Found: as nearly as the tolerance asks.
+    """
+    c, ca, cb, _ = cell_at(ints, leaf, face, a, b)
+    # The first step is the table's.
+    w, wa, wb = np.float64(tab[c + VALUE]), np.float64(tab[c + SLOPE_A]), np.float64(tab[c + SLOPE_B])
+    ca, cb, m = _step(px, py, pz, face, ca, cb, w, wa, wb)
+    last = max(abs(ca - a), abs(cb - b))
+    if not m > 0.0 or abs(ca) > 1.0 or abs(cb) > 1.0:
+        return False, ca, cb, w, wa, wb
+    for _ in range(STEPS):
+        w, wa, wb = inverse_radius_jet(blob, ints, leaf, face, ca, cb)
+        if w == 0.0:
+            return False, ca, cb, w, wa, wb
+        na, nb, m = _step(px, py, pz, face, ca, cb, w, wa, wb)
+        move = max(abs(na - ca), abs(nb - cb))
+        if not m > 0.0 or abs(na) > 1.0 or abs(nb) > 1.0 or move > 0.7 * last:
+            return True, ca, cb, w, wa, wb
+        if move < CLOSE * tolerance * w:
+            return True, ca, cb, w, wa, wb
+        last = move
+        ca, cb = na, nb
+    w, wa, wb = inverse_radius_jet(blob, ints, leaf, face, ca, cb)
+    return w > 0.0, ca, cb, w, wa, wb
+
+
+@unmanaged
+def _ball_is_free(blob, ints, tab, leaf, local, spare, radius, reach, away2, face, a, b, m, ca, cb, w, wa, wb):
+    """Return whether no surface of a leaf lies nearer than `radius` to a point; its frame, the point: local's START.
+
+    (a, b, m): the point's chart. (ca, cb), w, wa, wb: its foot, squared distance away2, and the jet there. reach: no
+    less than radius and the distance of the foot.
+    """
+    if m <= 2.0 * reach:
+        return False
+    gx, gy, gz = plane_of(face, ca, cb, w, wa, wb)
+    g = math.sqrt(gx * gx + gy * gy + gz * gz)
+    height = (gx * local[START] + gy * local[START + 1] + gz * local[START + 2] - 1.0) / g
+    way = -1 if height > 0.0 else 1
+    # Directions of the ball: |a′ − a| ≤ R √(1 + a²)/(m − R).
+    turn = reach / (m - reach) * (1.0 + 1e-9)
+    turn_a, turn_b = turn * math.sqrt(1.0 + a * a), turn * math.sqrt(1.0 + b * b)
+    if abs(a) + turn_a > 1.0 or abs(b) + turn_b > 1.0:
+        bend = _bend_beyond(tab, ints, leaf, reach, way, local, spare[0])
+    else:
+        bend = _bend(tab, ints, leaf, face, a - turn_a, a + turn_a, b - turn_b, b + turn_b, m - reach, way)
+    kappa = bend / g
+    if kappa * radius < 1.0 and kappa * (away2 - radius * radius) <= 2.0 * (abs(height) - radius):
+        return True
+    local[LENGTH2] = 0.0
+    half = max(turn_a + abs(ca - a), turn_b + abs(cb - b))
+    return square_is_free(blob, ints, tab, leaf, local, radius, face, ca, cb, half)
+
+
+@unmanaged
+def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, local, spare):
+    """Return (distance, outcome) of a point of the owner's region (leaf's frame) to its own leaf, along the chart.
+
+    FREE: no surface of this leaf lies nearer than the distance less the tolerance; PROVEN: nor any other. Distance is
+    infinite where nothing was found in the region; else local's FOOT and SPOT are that of the surface point. spare:
+    (ROOM, 3) scratch.
     """
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
     leaf = ints[o + OWNER_RECORD]
     if ints[o + OWNER_KIND] != MODEL or not has_jets(ints, leaf) or (px == 0.0 and py == 0.0 and pz == 0.0):
-        return np.inf, False
+        return np.inf, UNPROVEN
     face, a, b, m = face_of(px, py, pz)
-    planes, count = ints[o + OWNER_PLANE_FLOATS], ints[o + OWNER_PLANES]
-    gap = m
-    for k in range(count):
-        q = planes + 4 * k
-        gap = min(gap, blob[q + 3] - (blob[q] * px + blob[q + 1] * py + blob[q + 2] * pz))
-    # The first step is the table's.
-    c, ca, cb, _ = cell_at(ints, leaf, face, a, b)
-    w, ga, gb = np.float64(tab[c + VALUE]), np.float64(tab[c + SLOPE_A]), np.float64(tab[c + SLOPE_B])
-    ca, cb, nm = _step(px, py, pz, face, ca, cb, w, ga, gb)
-    last = max(abs(ca - a), abs(cb - b))
-    if not nm > 0.0 or abs(ca) > 1.0 or abs(cb) > 1.0:
-        return np.inf, False
-    for _ in range(STEPS):
-        w, ga, gb = inverse_radius_jet(blob, ints, leaf, face, ca, cb)
-        if w == 0.0:
-            return np.inf, False
-        na, nb, nm = _step(px, py, pz, face, ca, cb, w, ga, gb)
-        move = max(abs(na - ca), abs(nb - cb))
-        if not nm > 0.0 or abs(na) > 1.0 or abs(nb) > 1.0 or move > 0.7 * last:
-            break
-        if move * move < 1e-5 * tolerance * w:
-            break
-        last = move
-        ca, cb = na, nb
-    else:
-        w, ga, gb = inverse_radius_jet(blob, ints, leaf, face, ca, cb)
-        if w == 0.0:
-            return np.inf, False
+    found, ca, cb, w, wa, wb = _descend(blob, ints, tab, leaf, face, a, b, px, py, pz, tolerance)
+    if not found:
+        return np.inf, UNPROVEN
     x, y, z = direction_of(face, ca, cb)
     x, y, z = x / w, y / w, z / w
+    planes = ints[o + OWNER_PLANE_FLOATS]
+    gap = np.inf
+    for k in range(ints[o + OWNER_PLANES]):
+        q = planes + 4 * k
+        gap = min(gap, blob[q + 3] - (blob[q] * px + blob[q + 1] * py + blob[q + 2] * pz))
+        if blob[q] * x + blob[q + 1] * y + blob[q + 2] * z > blob[q + 3] + 1e-9:
+            return np.inf, UNPROVEN
     local[FOOT], local[FOOT + 1], local[FOOT + 2] = x, y, z
+    local[START], local[START + 1], local[START + 2] = px, py, pz
     set_spot(local, owner, face, ca, cb)
     rx, ry, rz = px - x, py - y, pz - z
     away2 = rx * rx + ry * ry + rz * rz
     distance = math.sqrt(away2)
-    for k in range(count):
-        q = planes + 4 * k
-        if blob[q] * x + blob[q + 1] * y + blob[q + 2] * z > blob[q + 3] + 1e-9:
-            return np.inf, False
-    if gap <= distance or m <= 2.0 * distance:
-        return distance, False
-    if distance <= tolerance:
-        return distance, True
-    radius = distance - tolerance
-    gx, gy, gz = plane_of(face, ca, cb, w, ga, gb)
-    g = math.sqrt(gx * gx + gy * gy + gz * gz)
-    height = (gx * px + gy * py + gz * pz - 1.0) / g
+    if gap <= distance and distance > NEARBY * m:
+        return distance, UNPROVEN
+    if distance > tolerance and not _ball_is_free(
+        blob, ints, tab, leaf, local, spare, distance - tolerance, distance, away2, face, a, b, m, ca, cb, w, wa, wb
+    ):
+        return distance, UNPROVEN
+    return distance, (FREE if gap <= distance and distance > tolerance else PROVEN)
+
+
+@unmanaged
+def leaf_is_free(blob, ints, tab, leaf, px, py, pz, radius, tolerance, local, spare):
+    """Return whether no surface of a leaf, in its region or beyond, is nearer than `radius` to a point of its frame."""
+    if not has_jets(ints, leaf) or (px == 0.0 and py == 0.0 and pz == 0.0):
+        return False
+    face, a, b, m = face_of(px, py, pz)
+    found, ca, cb, w, wa, wb = _descend(blob, ints, tab, leaf, face, a, b, px, py, pz, tolerance)
+    if not found:
+        return False
+    x, y, z = direction_of(face, ca, cb)
+    rx, ry, rz = px - x / w, py - y / w, pz - z / w
+    away2 = rx * rx + ry * ry + rz * rz
+    distance = math.sqrt(away2)
+    if distance < radius:
+        return False
     local[START], local[START + 1], local[START + 2] = px, py, pz
-    way = -1 if height > 0.0 else 1
-    # Directions of the ball: |a′ − a| ≤ R √(1 + a²)/(m − R).
-    reach = distance / (m - distance) * (1.0 + 1e-9)
-    reach_a, reach_b = reach * math.sqrt(1.0 + a * a), reach * math.sqrt(1.0 + b * b)
-    if abs(a) + reach_a > 1.0 or abs(b) + reach_b > 1.0:
-        bend = _bend_beyond(tab, ints, leaf, distance, way, local, spare[0])
-    else:
-        bend = _bend(
-            tab, ints, leaf, face, a - reach_a, a + reach_a, b - reach_b, b + reach_b, m - distance, way
-        )  # fmt: skip
-    kappa = bend / g
-    if kappa * radius < 1.0 and kappa * (away2 - radius * radius) <= 2.0 * (abs(height) - radius):
-        return distance, True
-    half = max(reach_a + abs(ca - a), reach_b + abs(cb - b))
-    local[LENGTH2] = 0.0
-    return distance, square_is_free(blob, ints, tab, leaf, local, radius, face, ca, cb, half)
+    return _ball_is_free(blob, ints, tab, leaf, local, spare, radius, distance, away2, face, a, b, m, ca, cb, w, wa, wb)

@@ -12,7 +12,7 @@ from hhsr.kernels.cell import inverse_radius
 from hhsr.kernels.descent import descend
 from hhsr.kernels.discs import BLOCK, DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment, lowest_bit
 from hhsr.kernels.facets import facet_cell
-from hhsr.kernels.foot import square_is_free
+from hhsr.kernels.foot import NEARBY, square_is_free
 from hhsr.kernels.layout import (
     ERROR,
     FACET_CODES,
@@ -59,7 +59,6 @@ ROUNDING = 1e-9  # of the coordinates
 PATIENCE = 16  # facets that may wait
 WIDEST = 0.125  # half side, in the chart, of the first square about a foot that is tried
 TRIES = 3
-NEARBY = 0.1  # of the foot's distance from its centre: from farther away a surface's own bends make many feet of it
 SAMPLES = 4  # points of a segment that ask for a seed
 
 
