@@ -12,6 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from hhsr.kernels.curve_order import order_along_curve
 from hhsr.model import FloatArray
 
 PARTS_PER_THREAD = 4
@@ -52,31 +53,7 @@ def in_parts(count: int, smallest: int, work: Callable[[int, int], Any]) -> list
 
 
 def neighbours_first(points: FloatArray) -> NDArray[np.int64]:
-    """Return an order of points (n, 3) in which neighbours follow each other: they read the same tables.
-
-    Along Morton's curve over the box of the finite ones, 32 cells a side: 15 bits are sorted in passes, not compared.
-    """
-    finite = np.isfinite(points)
-    low = np.min(points, axis=0, where=finite, initial=np.inf)
-    extent = np.max(points, axis=0, where=finite, initial=-np.inf) - low
-    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        share = (points - low) * (31.0 / np.maximum(extent, 1e-300))
-    cell = np.where(finite, np.clip(np.nan_to_num(share), 0.0, 31.0), 0.0).astype(np.uint16)
-    for shift, mask in ((8, 0x100F), (4, 0x10C3), (2, 0x1249)):
-        cell = (cell | (cell << np.uint16(shift))) & np.uint16(mask)
-    return np.argsort(cell[:, 0] << 2 | cell[:, 1] << 1 | cell[:, 2], kind="stable")
-
-
-def among_neighbours(
-    points: FloatArray, outputs: tuple[FloatArray, ...], smallest: int, work: Callable[..., int]
-) -> int:
-    """Return the sum of work(points, *outputs) over parts of points (n, 3), neighbours together.
-
-    outputs: (n, …) each, filled in the order of the points.
-    """
-    order = neighbours_first(points)
-    near, found = points[order], [np.empty_like(out) for out in outputs]
-    total = int(sum(in_parts(len(near), smallest, lambda i, j: work(near[i:j], *(out[i:j] for out in found)))))
-    for out, values in zip(outputs, found, strict=True):
-        out[order] = values
-    return total
+    """Return an order of points (n, 3) in which neighbours follow each other: they read the same tables."""
+    order = np.empty(len(points), dtype=np.int64)
+    order_along_curve(points, np.empty(len(points), dtype=np.int32), order)
+    return order

@@ -26,7 +26,7 @@ from hhsr.answers import (
     one_row,
     scalar,
 )
-from hhsr.batches import among_neighbours, in_parts
+from hhsr.batches import in_parts, neighbours_first
 from hhsr.check import as_float, as_points, as_rigid, require_finite
 from hhsr.compiled import Compiled, compile_tree
 from hhsr.errors import FileFormatError, InputError
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 RESOLUTION_MM = 0.01
 CROSSING_TOLERANCE_MM = 0.001
 TOLERANCE_MM = 0.01
+ALONE = np.zeros(1, dtype=np.int64)  # the order of a single row
 
 
 class Shape:
@@ -188,7 +189,7 @@ class Shape:
         """
         if (row := one_row(points)) is not None and on_invalid == "raise":
             distance, tolerance = np.empty(1), as_float(tolerance_mm, "tolerance_mm", 1e-6, 1e3)
-            if distance_kernels.nearest_many(self._blob, row, tolerance, distance, np.empty((1, 3))) == 0:
+            if distance_kernels.nearest_many(self._blob, row, ALONE, tolerance, distance, np.empty((1, 3))) == 0:
                 return distance.item()
         return self._nearest(points, on_invalid, tolerance_mm)[1]
 
@@ -203,8 +204,13 @@ class Shape:
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-6, 1e3)
         flat = array.reshape(-1, 3)
         distance, foot, blob = np.empty(len(flat)), np.empty((len(flat), 3)), self._blob
-        bad = among_neighbours(
-            flat, (distance, foot), 1_000, lambda p, d, f: distance_kernels.nearest_many(blob, p, tolerance, d, f)
+        order = neighbours_first(flat)
+        bad = sum(
+            in_parts(
+                len(flat),
+                1_000,
+                lambda i, j: distance_kernels.nearest_many(blob, flat, order[i:j], tolerance, distance, foot),
+            )
         )
         if bad and not mark:
             require_finite(array, "points")

@@ -43,6 +43,7 @@ from hhsr.kernels.patch import (
     LENGTH2,
     NODE_ROOM,
     SEARCH_SIZE,
+    SIDE,
     SPOT,
     START,
     TOLERANCE,
@@ -58,7 +59,7 @@ from hhsr.kernels.unmanaged import managed, unmanaged
 from hhsr.kernels.voxels import solid_contains
 
 SPANS = 256  # parts of one segment's stretch inside
-SIDE = 1e-6  # mm: how far off a plane its two sides are asked
+ASIDE = 1e-6  # mm: how far off a plane its two sides are asked
 
 
 @managed
@@ -83,7 +84,7 @@ def set_search(search, px, py, pz, dx, dy, dz, tolerance):
     search[LENGTH2] = dx * dx + dy * dy + dz * dz
     search[BEST], search[BEST_T] = FAR, 0.0
     search[FOOT], search[FOOT + 1], search[FOOT + 2] = np.nan, np.nan, np.nan
-    search[TOLERANCE], search[SPOT] = tolerance, -1.0
+    search[TOLERANCE], search[SPOT], search[SIDE] = tolerance, -1.0, 0.0
 
 
 @unmanaged
@@ -111,8 +112,8 @@ def _nearest_step(blob, ints, tab, search):
             if abs(h) < search[BEST]:
                 x, y, z = px - h * nx, py - h * ny, pz - h * nz
                 if solid_contains(
-                    blob, ints, tab, np.int64(0), x + SIDE * nx, y + SIDE * ny, z + SIDE * nz
-                ) != solid_contains(blob, ints, tab, np.int64(0), x - SIDE * nx, y - SIDE * ny, z - SIDE * nz):
+                    blob, ints, tab, np.int64(0), x + ASIDE * nx, y + ASIDE * ny, z + ASIDE * nz
+                ) != solid_contains(blob, ints, tab, np.int64(0), x - ASIDE * nx, y - ASIDE * ny, z - ASIDE * nz):
                     offer(search, abs(h), float(end), x, y, z)
     for k in range(ints[EDGE_COUNT]):
         o = ints[EDGE_FLOATS] + 6 * k
@@ -158,15 +159,15 @@ def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def nearest_many(blob, points, tolerance, distance, foot):
+def nearest_many(blob, points, order, tolerance, distance, foot):
     """Fill (n,) signed distance (mm) and (n, 3) nearest surface point of LPS points; NaN where not finite.
 
-    Returns how many are not finite.
+    order: the rows to be asked, one after another. Returns how many of them are not finite.
     """
     ints, tab = integers(blob), tables(blob)
     search, local, nodes, keys, corners, spare, rects = near_scratch()
     bad = 0
-    for i in range(points.shape[0]):
+    for i in order:
         if not (math.isfinite(points[i, 0]) and math.isfinite(points[i, 1]) and math.isfinite(points[i, 2])):
             distance[i] = np.nan
             foot[i, 0], foot[i, 1], foot[i, 2] = np.nan, np.nan, np.nan
@@ -175,7 +176,10 @@ def nearest_many(blob, points, tolerance, distance, foot):
         x, y, z = into_tree(blob, ints, points[i, 0], points[i, 1], points[i, 2])
         set_search(search, x, y, z, 0.0, 0.0, 0.0, tolerance)
         search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
-        distance[i] = -search[BEST] if solid_contains(blob, ints, tab, np.int64(0), x, y, z) else search[BEST]
+        side = search[SIDE]
+        if side == 0.0:
+            side = -1.0 if solid_contains(blob, ints, tab, np.int64(0), x, y, z) else 1.0
+        distance[i] = side * search[BEST]
         foot[i, 0], foot[i, 1], foot[i, 2] = out_of_tree(blob, ints, search[FOOT], search[FOOT + 1], search[FOOT + 2])
     return bad
 

@@ -27,7 +27,7 @@ from hhsr.kernels.layout import (
     VALUE,
 )
 from hhsr.kernels.maps import bend_over, cell_at, plane_of, rests_over
-from hhsr.kernels.patch import FOOT, LENGTH2, START, set_spot
+from hhsr.kernels.patch import FOOT, LENGTH2, SIDE, START, set_spot
 from hhsr.kernels.quadratic import square_is_clear
 from hhsr.kernels.unmanaged import unmanaged
 
@@ -162,6 +162,7 @@ def _ball_is_free(blob, ints, tab, leaf, local, spare, radius, reach, away2, fac
         bend = _bend(tab, ints, leaf, face, a - turn_a, a + turn_a, b - turn_b, b + turn_b, m - reach, way)
     kappa = bend / g
     if kappa * radius < 1.0 and kappa * (away2 - radius * radius) <= 2.0 * (abs(height) - radius):
+        local[SIDE] = 1.0 if height > 0.0 else -1.0  # of the ball that touches the surface, and the point is in it
         return True
     local[LENGTH2] = 0.0
     half = max(turn_a + abs(ca - a), turn_b + abs(cb - b))
@@ -173,8 +174,8 @@ def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, local, spare):
     """Return (distance, outcome) of a point of the owner's region (leaf's frame) to its own leaf, along the chart.
 
     FREE: no surface of this leaf lies nearer than the distance less the tolerance; PROVEN: nor any other. Distance is
-    infinite where nothing was found in the region; else local's FOOT and SPOT are that of the surface point. spare:
-    (ROOM, 3) scratch.
+    infinite where nothing was found in the region; else local's FOOT and SPOT are that of the surface point, and SIDE
+    is the point's. spare: (ROOM, 3) scratch.
     """
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
     leaf = ints[o + OWNER_RECORD]
@@ -196,6 +197,7 @@ def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, local, spare):
     local[FOOT], local[FOOT + 1], local[FOOT + 2] = x, y, z
     local[START], local[START + 1], local[START + 2] = px, py, pz
     set_spot(local, owner, face, ca, cb)
+    local[SIDE] = 0.0
     rx, ry, rz = px - x, py - y, pz - z
     away2 = rx * rx + ry * ry + rz * rz
     distance = math.sqrt(away2)

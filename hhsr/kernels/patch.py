@@ -24,9 +24,10 @@ from hhsr.kernels.polygon import clip_polygon, polygon_to_segment
 from hhsr.kernels.unmanaged import unmanaged
 
 # Slots of a search: start 3, vector 3, squared length; best distance, t, point 3 (owner's frame); tolerance; and where
-# the best point is a foot, its spot: owner (−1: it is none), face, a, b.
-START, VECTOR, LENGTH2, BEST, BEST_T, FOOT, TOLERANCE, SPOT = 0, 3, 6, 7, 8, 9, 12, 13
-SEARCH_SIZE = 17
+# the best point is a foot, its spot: owner (−1: it is none), face, a, b; last, where the start is proven to lie: 1
+# outside, −1 inside, 0 not known.
+START, VECTOR, LENGTH2, BEST, BEST_T, FOOT, TOLERANCE, SPOT, SIDE = 0, 3, 6, 7, 8, 9, 12, 13, 17
+SEARCH_SIZE = 18
 LATE = 256  # room for pending nodes
 NODE_ROOM = 256  # room for facets to be settled, and for parts of one
 FAR = 1e150  # mm: no surface point found yet; finite, so that "no surface here" (infinite) is beyond it
