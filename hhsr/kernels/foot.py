@@ -160,6 +160,8 @@ def _ball_is_free(blob, ints, tab, leaf, local, spare, radius, reach, away2, fac
         bend = _bend_beyond(tab, ints, leaf, reach, way, local, spare[0])
     else:
         bend = _bend(tab, ints, leaf, face, a - turn_a, a + turn_a, b - turn_b, b + turn_b, m - reach, way)
+    if bend == np.inf:
+        return False
     kappa = bend / g
     if kappa * radius < 1.0 and kappa * (away2 - radius * radius) <= 2.0 * (abs(height) - radius):
         local[SIDE] = 1.0 if height > 0.0 else -1.0  # of the ball that touches the surface, and the point is in it

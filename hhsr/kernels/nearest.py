@@ -181,10 +181,14 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
     levels, codes = ints[FACET_LEVELS], ints[FACET_CODES]
     moving = search[LENGTH2] > 0.0
     local[VECTOR], local[VECTOR + 1], local[VECTOR + 2] = 0.0, 0.0, 0.0
-    if moving:
-        _seed_segment(blob, ints, search, local)
-    else:
-        seed_point(blob, ints, search)
+    local[TOLERANCE] = search[TOLERANCE]
+    own, free = _free_about(blob, ints, tab, search, local)
+    if free == 0.0:
+        if moving:
+            _seed_segment(blob, ints, search, local)
+        else:
+            seed_point(blob, ints, search)
+        own, free = _free_about(blob, ints, tab, search, local)
     x, y, z = search[START], search[START + 1], search[START + 2]
     dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
     first = ints[levels + 1 + 2 * ints[levels]]
@@ -196,7 +200,6 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
     local[LENGTH2], local[TOLERANCE] = search[LENGTH2], search[TOLERANCE]
     loose = LOOSE * (reach + blob[ints[SEED_FRAME] + 4])
     limit = search[BEST] - search[TOLERANCE]
-    own, free = _free_about(blob, ints, tab, search, local)
     free -= 2.0 * loose
     fx, fy, fz = search[FOOT], search[FOOT + 1], search[FOOT + 2]
     depth, waiting = 1, 0
