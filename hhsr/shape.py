@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 RESOLUTION_MM = 0.01
 CROSSING_TOLERANCE_MM = 0.001
 TOLERANCE_MM = 0.01
-ALONE = np.zeros(1, dtype=np.int64)  # the order of a single row
 
 
 class Shape:
@@ -187,10 +186,12 @@ class Shape:
 
         NaN where a point is not finite, with on_invalid="mark"; +inf for an empty solid.
         """
-        if (row := one_row(points)) is not None and on_invalid == "raise":
-            distance, tolerance = np.empty(1), as_float(tolerance_mm, "tolerance_mm", 1e-6, 1e3)
-            if distance_kernels.nearest_many(self._blob, row, ALONE, tolerance, distance, np.empty((1, 3))) == 0:
-                return distance.item()
+        if is_point(points) and on_invalid == "raise":
+            tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-6, 1e3)
+            x, y, z = points.tolist()
+            distance: float = distance_kernels.distance_one(self._blob, x, y, z, tolerance)
+            if distance == distance:  # else it is NaN: the row is named below
+                return distance
         return self._nearest(points, on_invalid, tolerance_mm)[1]
 
     def closest_point(
