@@ -58,6 +58,7 @@ from hhsr.kernels.tree import (
 from hhsr.kernels.unmanaged import managed, unmanaged
 from hhsr.kernels.voxels import solid_contains
 
+ROUGHLY = 6.0  # tolerances: as nearly as a foot is sought that is to lower a bound of the depth
 SPANS = 256  # parts of one segment's stretch inside
 ASIDE = 1e-6  # mm: how far off a plane its two sides are asked
 
@@ -244,21 +245,22 @@ def deepest(
     blob, ints, tab, px, py, pz, dx, dy, dz, t0, t1, on0, on1, tolerance, floor, out,
     search, local, nodes, keys, corners, spare, rects, spans,
 ):  # fmt: skip
-    """Return an upper bound, at most `tolerance` above the truth, of the depth on [t0, t1] where p + t·d is inside.
+    """Return an upper bound of the depth on [t0, t1] where p + t·d is inside, at most `tolerance` above the truth.
 
-    Any surface point bounds the depth at every t by its distance. So intervals between two t are bounded by the surface
-    points found at both, and parted where that bound is highest, by points found on the way down that nothing proves;
-    only where these lower it no more is the true distance asked. `floor`: a depth already known; no more than that need
-    be proven below it. on0, on1: the ends lie on the surface. out: best t and foot (4,).
+    Or above `floor`, a depth already known: no more than that need be proven below it. Any surface point bounds the
+    depth at every t by its distance. So intervals between two t are bounded by the surface points found at both, and
+    parted where that bound is highest, by points found on the way down that nothing proves; only where these lower it
+    no more is the true distance asked, as nearly as the bound leaves room for. on0, on1: the ends lie on the surface.
+    out: best t and foot (4,).
     """
-    inner = 0.5 * tolerance
-    best = floor
+    near = 0.25 * tolerance
+    sure = 0.0  # a depth that is reached
     for k in range(2):
         t = t0 if k == 0 else t1
         x, y, z = px + t * dx, py + t * dy, pz + t * dz
         if not (on0 if k == 0 else on1):
             # Some surface point will do: if the bound is highest here, the true distance is asked below.
-            set_search(search, x, y, z, 0.0, 0.0, 0.0, inner)
+            set_search(search, x, y, z, 0.0, 0.0, 0.0, ROUGHLY * tolerance)
             seed_point(blob, ints, search)
             if search[BEST] == FAR:
                 search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
@@ -270,32 +272,33 @@ def deepest(
         spans[0, 7],
     )  # fmt: skip
     used = 1
-    while True:
+    for turn in range(2 * SPANS):
         s = 0
         for k in range(1, used):
             if spans[k, 8] > spans[s, 8]:
                 s = k
         value, t = spans[s, 8], spans[s, 9]
-        if not value > best + inner or used == spans.shape[0]:
-            return max(best, value)
+        if value <= max(sure + tolerance, floor) or used == spans.shape[0] or turn == 2 * SPANS - 1:
+            break
         a, ax, ay, az = spans[s, 0], spans[s, 1], spans[s, 2], spans[s, 3]
         b, bx, by, bz = spans[s, 4], spans[s, 5], spans[s, 6], spans[s, 7]
-        set_search(search, px + t * dx, py + t * dy, pz + t * dz, 0.0, 0.0, 0.0, inner)
+        set_search(search, px + t * dx, py + t * dy, pz + t * dz, 0.0, 0.0, 0.0, ROUGHLY * tolerance)
         if a < t < b:
             seed_point(blob, ints, search)
             for k in range(2):
-                if not search[BEST] < value - 0.5 * inner:
+                if not search[BEST] < value - near:
                     x, y, z = (ax, ay, az) if k == 0 else (bx, by, bz)
                     descend_from(blob, ints, x, y, z, search)
-        if not search[BEST] < value - 0.5 * inner:
+        if not search[BEST] < value - near:
             # Nothing nearer is known, or the bound is highest where a point already found is the nearest known: what is
             # the true distance there?
+            room = 0.9 * tolerance - max(value - search[BEST], 0.0)
+            search[TOLERANCE] = room
             search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
-            if search[BEST] > best:
-                best = search[BEST]
-                out[0], out[1], out[2], out[3] = t, search[FOOT], search[FOOT + 1], search[FOOT + 2]
-            if value <= best + inner:
-                return max(best, value)
+            if search[BEST] - room > sure:
+                sure = search[BEST] - room
+                if search[BEST] > floor:
+                    out[0], out[1], out[2], out[3] = t, search[FOOT], search[FOOT + 1], search[FOOT + 2]
         x, y, z = search[FOOT], search[FOOT + 1], search[FOOT + 2]
         if a < t < b:
             _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, t, x, y, z)
@@ -305,6 +308,7 @@ def deepest(
             _put_span(spans, s, px, py, pz, dx, dy, dz, a, x, y, z, b, bx, by, bz)
         else:
             _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, b, x, y, z)
+    return max(floor, value)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
