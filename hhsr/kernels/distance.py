@@ -119,23 +119,21 @@ def _nearest_step(blob, ints, tab, search):
                     offer(search, abs(h), float(end), x, y, z)
     for k in range(ints[EDGE_COUNT]):
         o = ints[EDGE_FLOATS] + 6 * k
-        ux, uy, uz = blob[o + 3] - blob[o], blob[o + 4] - blob[o + 1], blob[o + 5] - blob[o + 2]
-        d2, t, s = segment_to_segment(
-            search[START],
-            search[START + 1],
-            search[START + 2],
-            search[VECTOR],
-            search[VECTOR + 1],
-            search[VECTOR + 2],
-            blob[o],
-            blob[o + 1],
-            blob[o + 2],
-            ux,
-            uy,
-            uz,
-        )
+        ax, ay, az = blob[o], blob[o + 1], blob[o + 2]
+        ux, uy, uz = blob[o + 3] - ax, blob[o + 4] - ay, blob[o + 5] - az
+        if search[LENGTH2] > 0.0:
+            d2, t, s = segment_to_segment(
+                search[START], search[START + 1], search[START + 2], search[VECTOR], search[VECTOR + 1],
+                search[VECTOR + 2], ax, ay, az, ux, uy, uz,
+            )  # fmt: skip
+        else:
+            rx, ry, rz = search[START] - ax, search[START + 1] - ay, search[START + 2] - az
+            t, uu = 0.0, ux * ux + uy * uy + uz * uz
+            s = min(max((rx * ux + ry * uy + rz * uz) / uu, 0.0), 1.0) if uu > 0.0 else 0.0
+            rx, ry, rz = rx - s * ux, ry - s * uy, rz - s * uz
+            d2 = rx * rx + ry * ry + rz * rz
         if d2 < search[BEST] * search[BEST]:
-            offer(search, math.sqrt(d2), t, blob[o] + s * ux, blob[o + 1] + s * uy, blob[o + 2] + s * uz)
+            offer(search, math.sqrt(d2), t, ax + s * ux, ay + s * uy, az + s * uz)
 
 
 @unmanaged
