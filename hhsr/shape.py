@@ -79,6 +79,7 @@ class Shape:
             self.contains(points)
             self.field(points)
             self.closest_point(points)
+            self.signed_distance(points)
             self.crossings(points, points + 1.0)
             self.first_crossing(points, points + 1.0)
             self.clearance(points, points + 1.0)

@@ -107,6 +107,32 @@ def test_clearance_is_never_optimistic(depth: int, bands: bool, parts: bool) -> 
     assert shape.clearance(starts[0], ends[0], 2.0) == value[0] - 2.0
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_distance_has_the_sign_of_contains_about_the_surface(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    shape = Shape(random_tree(seed, depth=seed % 4, bands=False, parts=False))
+    low, high = shape.bounds
+    foot, _ = shape.closest_point(rng.uniform(low, high, (2000, 3)))
+    near = foot + rng.normal(size=foot.shape) * rng.choice([1e-9, 1e-3, 0.02, 0.5], (2000, 1))
+    np.testing.assert_array_equal(shape.signed_distance(near) <= 0.0, shape.contains(near))
+
+
+def test_the_deeper_of_two_stretches() -> None:
+    """Two balls of all but one depth on one segment: neither bound is loosened by the other."""
+    rng = np.random.default_rng(8)
+    for more in (0.0, 1e-3, 3e-3, 8e-3, 0.05):
+        radii = rng.permutation([10.0, 10.0 + more])
+        tree = Tree(
+            Cut(frozen([0.0, 0.0]), 0.0, 0.0, (), ball(radii[0], (-20.0, 0.0, 0.0)), ball(radii[1], (20.0, 0.0, 0.0))),
+            frozen(np.zeros(6)),
+        )
+        shape = Shape(tree)
+        for y in (0.0, 1.3, 7.7):
+            value = shape.clearance(np.array([-45.0, y, 0.0]), np.array([44.0, y, 0.0]), 0.5)
+            truth = -(10.0 + more - y) - 0.5
+            assert truth - 0.01 <= value <= truth + 1e-9
+
+
 def test_a_finer_tolerance_is_kept() -> None:
     shape = Shape(random_tree(3, 1))
     points = np.random.default_rng(0).uniform(shape.bounds[0], shape.bounds[1], (50, 3))

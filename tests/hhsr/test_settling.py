@@ -6,16 +6,21 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from hhsr.batches import neighbours_first
 from hhsr.compiled import compile_tree
 from hhsr.kernels import layout as at
+from hhsr.kernels.box_state import index_of
 from hhsr.kernels.cell import direction_of, inverse_radius
 from hhsr.kernels.discs import DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment, lowest_bit
 from hhsr.kernels.facets import _along_curve, facet_cell
+from hhsr.kernels.foot import jump_over, leaf_is_free
 from hhsr.kernels.jet import inverse_radius_bend
 from hhsr.kernels.layout import integers, tables
+from hhsr.kernels.maps import rests_over
 from hhsr.kernels.patch import LENGTH2, SEARCH_SIZE, START, VECTOR
+from hhsr.kernels.polygon import ROOM
 from hhsr.kernels.quadratic import least_over_square, square_is_clear
 from hhsr.kernels.tree import turn_out_of_leaf
 from hhsr.model import CentreGrid, FloatArray, ModelLeaf, ScaleField, Superquadric, Tree, frozen
@@ -128,6 +133,54 @@ def test_a_square_is_called_clear_only_where_it_is(one: ModelLeaf) -> None:
             assert not (clear and share > 1.0)
             called += clear
     assert called > 100  # not by calling nothing clear
+
+
+@pytest.mark.parametrize("one", LEAVES)
+def test_second_derivatives_change_no_more_over_many_cells(one: ModelLeaf) -> None:
+    rng = np.random.default_rng(6)
+    seen = 0
+    for blob, record, (_, face, a, b, _) in facets(one, 80, rng):
+        ints, tab = integers(blob), tables(blob)
+        n = ints[record + at.CELLS]
+        half = min(rng.choice([0.01, 0.05, 0.12]), 1.0 - max(abs(a), abs(b)))
+        window = [index_of(x, n) for x in (a - half, a + half, b - half, b + half)]
+        kink, third = rests_over(tab, ints, record, face, *window)
+        jet = np.array(inverse_radius_bend(blob, ints, record, face, a, b))
+        if not np.isfinite(third) or jet[0] == 0.0:
+            continue
+        kink += jump_over(blob, ints, record, face, a, b, half, jet[0])
+        for u, v in rng.uniform(-half, half, (30, 2)):
+            other = np.array(inverse_radius_bend(blob, ints, record, face, a + u, b + v))
+            if other[0] == 0.0 or other[0] > 1.5 * jet[0]:
+                continue
+            rest = other - jet
+            assert np.linalg.norm([[rest[3], rest[4]], [rest[4], rest[5]]], 2) <= kink + third * np.hypot(u, v) + 1e-12
+            seen += 1
+    assert seen > 150
+
+
+@pytest.mark.parametrize("one", LEAVES)
+def test_a_ball_is_called_free_only_where_it_is(one: ModelLeaf) -> None:
+    """Points about the surface and about the borders of faces and the planes where half axes change sides."""
+    rng = np.random.default_rng(7)
+    blob = compile_tree(Tree(one, frozen(np.zeros(6)))).blob
+    ints, tab = integers(blob), tables(blob)
+    record = ints[ints[at.OWNER_INTS] + at.OWNER_RECORD]
+    side = np.linspace(-1, 1, 150)
+    a, b = (x.ravel() for x in np.meshgrid(side, side))
+    points = np.concatenate([surface(blob, record, face, a, b) for face in range(6)])
+    tree = cKDTree(points)
+    spots = points[rng.integers(len(points), size=500)]
+    spots[:100, 0] = spots[:100, 1]
+    spots[100:150, 2] = 1e-3
+    spots += rng.normal(size=spots.shape) * rng.choice([0.05, 0.5, 4.0], (len(spots), 1))
+    local, spare, called = np.zeros(SEARCH_SIZE), np.empty((ROOM, 3)), 0
+    for p, nearest in zip(spots, tree.query(spots)[0], strict=True):
+        for share in (0.3, 0.8, 0.95, 1.0001, 1.05):
+            free = leaf_is_free(blob, ints, tab, record, *p, share * nearest, 0.01, local, spare)
+            assert not (free and share > 1.0)
+            called += free
+    assert called > 150
 
 
 def test_the_least_of_a_quadratic_over_a_square() -> None:
