@@ -16,6 +16,7 @@ from hhsr.kernels.curve_order import order_along_curve
 from hhsr.model import FloatArray
 
 PARTS_PER_THREAD = 4
+FEW = 2_000
 _POOLS: dict[int, ThreadPoolExecutor] = {}
 _OPENING = Lock()
 _THREAD = local()
@@ -53,7 +54,12 @@ def in_parts(count: int, smallest: int, work: Callable[[int, int], Any]) -> list
 
 
 def neighbours_first(points: FloatArray) -> NDArray[np.int64]:
-    """Return an order of points (n, 3) in which neighbours follow each other: they read the same tables."""
+    """Return an order of points (n, 3) in which neighbours follow each other: they read the same tables.
+
+    Of few points they lie too far apart for that: these stay as they are.
+    """
+    if len(points) < FEW:
+        return np.arange(len(points))
     order = np.empty(len(points), dtype=np.int64)
     order_along_curve(points, np.empty(len(points), dtype=np.int32), order)
     return order

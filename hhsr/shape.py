@@ -207,11 +207,12 @@ class Shape:
         flat = array.reshape(-1, 3)
         distance, foot, blob = np.empty(len(flat)), np.empty((len(flat), 3)), self._blob
         order = neighbours_first(flat)
+        near = flat[order]
         bad = sum(
             in_parts(
                 len(flat),
                 1_000,
-                lambda i, j: distance_kernels.nearest_many(blob, flat, order[i:j], tolerance, distance, foot),
+                lambda i, j: distance_kernels.nearest_many(blob, near[i:j], order[i:j], tolerance, distance, foot),
             )
         )
         if bad and not mark:

@@ -182,20 +182,21 @@ def distance_one(blob, x, y, z, tolerance):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def nearest_many(blob, points, order, tolerance, distance, foot):
-    """Fill (n,) signed distance (mm) and (n, 3) nearest surface point of LPS points; NaN where not finite.
+    """Fill (n,) signed distance (mm) and (n, 3) nearest surface point of LPS points (m, 3); NaN where not finite.
 
-    order: the rows to be asked, one after another. Returns how many of them are not finite.
+    order: (m,) the row of the answers that each is for. Returns how many are not finite.
     """
     ints, tab = integers(blob), tables(blob)
     search, local, nodes, keys, corners, spare, rects = near_scratch()
     bad = 0
-    for i in order:
-        if not (math.isfinite(points[i, 0]) and math.isfinite(points[i, 1]) and math.isfinite(points[i, 2])):
+    for row in range(order.shape[0]):
+        i, x, y, z = order[row], points[row, 0], points[row, 1], points[row, 2]
+        if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
             distance[i] = np.nan
             foot[i, 0], foot[i, 1], foot[i, 2] = np.nan, np.nan, np.nan
             bad += 1
             continue
-        x, y, z = into_tree(blob, ints, points[i, 0], points[i, 1], points[i, 2])
+        x, y, z = into_tree(blob, ints, x, y, z)
         distance[i] = _signed_distance(
             blob, ints, tab, x, y, z, tolerance, search, local, nodes, keys, corners, spare, rects
         )
