@@ -105,17 +105,3 @@ def descend(blob, ints, owner, face, a, b, search):
         elif max(abs(a), abs(b)) > 1.0:
             face, a, b, _ = face_of(x, y, z)
     return False
-
-
-@unmanaged
-def descend_from(blob, ints, x, y, z, search):
-    """Descend from a surface point of the tree's frame; return whether it came to a foot."""
-    owner = owner_of(blob, ints, 0, x, y, z)
-    o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
-    if ints[o + OWNER_KIND] != MODEL:
-        return False
-    x, y, z = into_leaf(blob, ints, ints[o + OWNER_RECORD], x, y, z)
-    if x == 0.0 and y == 0.0 and z == 0.0:
-        return False
-    face, a, b, _ = face_of(x, y, z)
-    return descend(blob, ints, owner, face, a, b, search)

@@ -12,7 +12,6 @@ from numba import njit
 
 from hhsr.kernels.by_charts import nearest_by_charts
 from hhsr.kernels.crossing import follow_segment, scratch
-from hhsr.kernels.descent import descend_from
 from hhsr.kernels.discs import WIDE
 from hhsr.kernels.foot import FREE, UNPROVEN
 from hhsr.kernels.layout import (
@@ -284,10 +283,6 @@ def deepest(
         set_search(search, px + t * dx, py + t * dy, pz + t * dz, 0.0, 0.0, 0.0, ROUGHLY * tolerance)
         if a < t < b:
             seed_point(blob, ints, search)
-            for k in range(2):
-                if not search[BEST] < value - near:
-                    x, y, z = (ax, ay, az) if k == 0 else (bx, by, bz)
-                    descend_from(blob, ints, x, y, z, search)
         if not search[BEST] < value - near:
             # Nothing nearer is known, or the bound is highest where a point already found is the nearest known: what is
             # the true distance there?
