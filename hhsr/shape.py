@@ -23,10 +23,11 @@ from hhsr.answers import (
     curve,
     is_point,
     marks,
+    nearest_to_rows,
     one_row,
     scalar,
 )
-from hhsr.batches import in_parts, neighbours_first
+from hhsr.batches import in_parts
 from hhsr.check import as_float, as_points, as_rigid, require_finite
 from hhsr.compiled import Compiled, compile_tree
 from hhsr.errors import FileFormatError, InputError
@@ -205,16 +206,7 @@ class Shape:
         array, mark = as_points(points), marks(on_invalid)
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-6, 1e3)
         flat = array.reshape(-1, 3)
-        distance, foot, blob = np.empty(len(flat)), np.empty((len(flat), 3)), self._blob
-        order = neighbours_first(flat)
-        near = flat[order]
-        bad = sum(
-            in_parts(
-                len(flat),
-                1_000,
-                lambda i, j: distance_kernels.nearest_many(blob, near[i:j], order[i:j], tolerance, distance, foot),
-            )
-        )
+        distance, foot, bad = nearest_to_rows(self._blob, flat, tolerance)
         if bad and not mark:
             require_finite(array, "points")
         return foot.reshape(array.shape), scalar(distance.reshape(array.shape[:-1]))
