@@ -264,15 +264,17 @@ def _third(n_lo, n_hi, n1, n2, d, s1, s2, s3):
 
 @unmanaged
 def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
-    """Return (value, slope_a, slope_b, error, spread_a, spread_b, lo, hi, bend_lo, bend_hi, kink, third) of W.
+    """Return (value, slope_a, slope_b, error, spread_a, spread_b, lo, hi, bend_lo, bend_hi, kink, third, aa, ab, bb).
 
     |W − value − slope·δ| ≤ error, |∂W − slope| ≤ spread, lo ≤ W ≤ hi, the eigenvalues of ∂²W lie in [bend_lo, bend_hi],
     and ∂²W differs from that at the centre by no more than kink + r·third at r from it (infinite where the base is no
     ellipsoid or the field may be capped): all proven on the whole rectangle about (a, b).
-    `value` is the middle of that strip, not W at the centre. The rectangle must lie within one block of directions and
-    straddle no coordinate plane.
+    `value` is the middle of that strip, not W at the centre. (aa, ab, bb): ∂²W at the centre; then the slope is ∂W there,
+    and value W + (aa·half_a² + bb·half_b²)/4. NaN where it is not. The rectangle must lie within one block of directions
+    and straddle no coordinate plane.
     """
     bend_lo, bend_hi, kink, third = -math.inf, math.inf, math.inf, math.inf
+    bend_aa = bend_ab = bend_bb = math.nan
     block = block_of(face, a, b)
     s, sa, sb, wide_a, wide_b, saa, sab, sbb, rest2, rest3 = scale_range(
         blob, ints, leaf, block, face, a, b, half_a, half_b
@@ -363,6 +365,7 @@ def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
         if second < error:
             error = second
             slope_a, slope_b = exact_a, exact_b
+            bend_aa, bend_ab, bend_bb = aa, ab, bb
             # The slopes are exact ones at the centre now; their spread by whichever bound is smaller.
             wide_a = half_a * abs(aa) + half_b * abs(ab) + r * (kink + 0.5 * rise)
             wide_b = half_a * abs(ab) + half_b * abs(bb) + r * (kink + 0.5 * rise)
@@ -371,4 +374,7 @@ def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
             value += 0.5 * (low + high)
             reach = abs(slope_a) * half_a + abs(slope_b) * half_b + error
             w_lo, w_hi = max(w_lo, value - reach), min(w_hi, value + reach)
-    return value, slope_a, slope_b, error, spread_a, spread_b, w_lo, w_hi, bend_lo, bend_hi, kink, third
+    return (
+        value, slope_a, slope_b, error, spread_a, spread_b, w_lo, w_hi, bend_lo, bend_hi, kink, third,
+        bend_aa, bend_ab, bend_bb,
+    )  # fmt: skip

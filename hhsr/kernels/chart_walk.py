@@ -8,8 +8,8 @@ import math
 
 from hhsr.kernels.cell import chart_of, face_of, inverse_radius
 from hhsr.kernels.clipped import merge_touches
-from hhsr.kernels.layout import ERROR, SLOPE_A, SLOPE_B, SPREAD_A, SPREAD_B, VALUE
-from hhsr.kernels.maps import cell_at
+from hhsr.kernels.layout import ERROR, SLOPE_A, SLOPE_B, VALUE
+from hhsr.kernels.maps import cell_at, spreads_of
 from hhsr.kernels.segment import face_crossings, leaf_crossings
 from hhsr.kernels.solve import share_to_t, solve_in_cell
 from hhsr.kernels.stretch import change
@@ -61,7 +61,8 @@ def follow_cells(
         f = w0 - (float(tab[o + VALUE]) + sa * (a0 - ca) + sb * (b0 - cb))
         slope = ww - sa * wa - sb * wb
         f0, f1 = f + x * slope, f + stop * slope
-        stray = float(tab[o + SPREAD_A]) * abs(wa) + float(tab[o + SPREAD_B]) * abs(wb)
+        stray_a, stray_b = spreads_of(tab, o, half)
+        stray = stray_a * abs(wa) + stray_b * abs(wb)
         if min(f0, f1) > error or max(f0, f1) < -error:
             state, count = change(state, f0 > 0.0, share_to_t(x, begin, end, w0, w1), gap, out, count)
         elif abs(slope) > stray + 1e-9 * (w0 + w1):

@@ -239,6 +239,25 @@ def _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, b, bx, by, bz):
 
 
 @unmanaged
+def _tell_spans(spans, used, px, py, pz, dx, dy, dz, x, y, z):
+    """Let a surface point stand for the ends of all spans that it is nearer to than their own."""
+    for s in range(used):
+        nearer = False
+        for o in range(0, 8, 4):
+            t = spans[s, o]
+            qx, qy, qz = px + t * dx, py + t * dy, pz + t * dz
+            own2 = (spans[s, o + 1] - qx) ** 2 + (spans[s, o + 2] - qy) ** 2 + (spans[s, o + 3] - qz) ** 2
+            if (x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2 < own2:
+                spans[s, o + 1], spans[s, o + 2], spans[s, o + 3] = x, y, z
+                nearer = True
+        if nearer:
+            _put_span(
+                spans, s, px, py, pz, dx, dy, dz, spans[s, 0], spans[s, 1], spans[s, 2], spans[s, 3], spans[s, 4],
+                spans[s, 5], spans[s, 6], spans[s, 7],
+            )  # fmt: skip
+
+
+@unmanaged
 def deepest(
     blob, ints, tab, px, py, pz, dx, dy, dz, t0, t1, on0, on1, tolerance, floor, out,
     search, local, nodes, keys, corners, spare, rects, spans,
@@ -288,6 +307,22 @@ def deepest(
             # the true distance there?
             room = 0.9 * tolerance - max(value - search[BEST], 0.0)
             search[TOLERANCE] = room
+            offer(
+                search,
+                math.sqrt((px + t * dx - ax) ** 2 + (py + t * dy - ay) ** 2 + (pz + t * dz - az) ** 2),
+                0.0,
+                ax,
+                ay,
+                az,
+            )
+            offer(
+                search,
+                math.sqrt((px + t * dx - bx) ** 2 + (py + t * dy - by) ** 2 + (pz + t * dz - bz) ** 2),
+                0.0,
+                bx,
+                by,
+                bz,
+            )
             search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
             if search[BEST] - room > sure:
                 sure = search[BEST] - room
@@ -302,6 +337,7 @@ def deepest(
             _put_span(spans, s, px, py, pz, dx, dy, dz, a, x, y, z, b, bx, by, bz)
         else:
             _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, b, x, y, z)
+        _tell_spans(spans, used, px, py, pz, dx, dy, dz, x, y, z)
     return max(floor, value)
 
 

@@ -53,10 +53,11 @@ BLOCK_ROWS = 5
 LANES = 8
 BLOCKS_PER_SIDE = 8
 
-# A cell: |W − (value + slope_a·δa + slope_b·δb)| ≤ error, |∂W/∂a − slope_a| ≤ spread_a, same for b.
-# ∂²W differs from that at the centre by no more than kink + third·r at r from it.
-CELL_SIZE = 8
-VALUE, SLOPE_A, SLOPE_B, ERROR, SPREAD_A, SPREAD_B, KINK, THIRD = 0, 1, 2, 3, 4, 5, 6, 7
+# A cell: |W − (value + slope_a·δa + slope_b·δb)| ≤ error; ∂²W at the centre, from which it differs by no more than
+# kink + third·r at r from it. Where no ∂²W is known bend_aa is NaN, bend_ab and bend_bb are the spreads: how far the
+# slopes stray. (Else these follow: `hhsr.kernels.maps.spreads_of`.)
+CELL_SIZE = 9
+VALUE, SLOPE_A, SLOPE_B, ERROR, KINK, THIRD, BEND_AA, BEND_AB, BEND_BB = 0, 1, 2, 3, 4, 5, 6, 7, 8
 FINEST_PARTING = 4  # a facet's code has eight bits for the cell
 
 

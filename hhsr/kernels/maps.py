@@ -12,6 +12,9 @@ from numba import njit
 
 from hhsr.kernels.cell import cell_model, direction_of
 from hhsr.kernels.layout import (
+    BEND_AA,
+    BEND_AB,
+    BEND_BB,
     BEND_SIZE,
     BEND_TABLE,
     BLOCK_ROWS,
@@ -25,8 +28,6 @@ from hhsr.kernels.layout import (
     PARTING,
     SLOPE_A,
     SLOPE_B,
-    SPREAD_A,
-    SPREAD_B,
     THIRD,
     VALUE,
     integers,
@@ -182,11 +183,29 @@ def outside_region(blob, planes, count, x, y, z, radius):
 
 
 @unmanaged
-def _write(out, value, ga, gb, error, half, da, db, kink, third):
+def _write(out, value, ga, gb, error, half, da, db, kink, third, aa, ab, bb):
     out[VALUE], out[SLOPE_A], out[SLOPE_B] = value, ga, gb
-    out[SPREAD_A], out[SPREAD_B] = (da + 1e-7 * abs(ga)) * UP, (db + 1e-7 * abs(gb)) * UP
     out[ERROR] = (error + 1e-7 * (value + (abs(ga) + abs(gb)) * half)) * UP
+    if math.isnan(aa):
+        out[BEND_AA], out[BEND_AB], out[BEND_BB] = aa, (da + 1e-7 * abs(ga)) * UP, (db + 1e-7 * abs(gb)) * UP
+    else:
+        out[BEND_AA], out[BEND_AB], out[BEND_BB] = aa, ab, bb
+        kink += 1e-7 * (abs(aa) + abs(ab) + abs(bb))  # what float32 leaves of them
     out[KINK], out[THIRD] = kink * UP, third * UP
+
+
+@unmanaged
+def spreads_of(tab, o, half):
+    """Return (spread_a, spread_b) of the cell at a float32 slot: how far ∂W strays from its slopes. half: its half side."""
+    aa, ab, bb = np.float64(tab[o + BEND_AA]), np.float64(tab[o + BEND_AB]), np.float64(tab[o + BEND_BB])
+    if math.isnan(aa):
+        return ab, bb
+    r = half * math.sqrt(2.0)
+    rest = r * (np.float64(tab[o + KINK]) + 0.5 * r * np.float64(tab[o + THIRD]))
+    return (
+        (half * (abs(aa) + abs(ab)) + rest) * UP + 2e-7 * abs(tab[o + SLOPE_A]),
+        (half * (abs(ab) + abs(bb)) + rest) * UP + 2e-7 * abs(tab[o + SLOPE_B]),
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -209,12 +228,12 @@ def prove_base(blob, leaf, n, planes, count, models, spans, thickness, bends):
         for i in range(n):
             for j in range(n):
                 a, b = (2 * i + 1) * half - 1.0, (2 * j + 1) * half - 1.0
-                value, ga, gb, error, da, db, lo, hi, b0, b1, kink, third = cell_model(
+                value, ga, gb, error, da, db, lo, hi, b0, b1, kink, third, aa, ab, bb = cell_model(
                     blob, ints, leaf, face, a, b, half, half
                 )
                 _put_bend(bends, face, i, j, b0, b1)
                 bends[face, i, j, 2], bends[face, i, j, 3] = kink * UP, third * UP
-                _write(models[face, i, j], value, ga, gb, error, half, da, db, kink, third)
+                _write(models[face, i, j], value, ga, gb, error, half, da, db, kink, third, aa, ab, bb)
                 spans[face, i, j, 0], spans[face, i, j, 1] = lo, hi
                 x, y, z, radius = cell_sphere(face, a, b, half, half, value, ga, gb, error, lo, hi)
                 if outside_region(blob, planes, count, x, y, z, radius):
@@ -223,9 +242,9 @@ def prove_base(blob, leaf, n, planes, count, models, spans, thickness, bends):
                 worst = 0.0
                 for q in range(4):
                     ca, cb = a + (0.5 * half if q & 1 else -0.5 * half), b + (0.5 * half if q & 2 else -0.5 * half)
-                    value, ga, gb, error, _, _, lo, hi, _, _, _, _ = cell_model(
+                    value, ga, gb, error, _, _, lo, hi = cell_model(
                         blob, ints, leaf, face, ca, cb, 0.5 * half, 0.5 * half
-                    )
+                    )[:8]
                     x, y, z, radius = cell_sphere(face, ca, cb, 0.5 * half, 0.5 * half, value, ga, gb, error, lo, hi)
                     if outside_region(blob, planes, count, x, y, z, radius):
                         continue
@@ -260,10 +279,10 @@ def prove_cells(blob, leaf, n, parting, models, spans, cells, bends):
                 for p in range(s):
                     for q in range(s):
                         a, b = (2 * (i * s + p) + 1) * half - 1.0, (2 * (j * s + q) + 1) * half - 1.0
-                        value, ga, gb, error, da, db, lo, hi, b0, b1, kink, third = cell_model(
+                        value, ga, gb, error, da, db, lo, hi, b0, b1, kink, third, aa, ab, bb = cell_model(
                             blob, ints, leaf, face, a, b, half, half
                         )
-                        _write(cells[first + p * s + q], value, ga, gb, error, half, da, db, kink, third)
+                        _write(cells[first + p * s + q], value, ga, gb, error, half, da, db, kink, third, aa, ab, bb)
                         low, high = min(low, lo), max(high, hi)
                         bend_lo, bend_hi = min(bend_lo, b0), max(bend_hi, b1)
                 _put_bend(bends, face, i, j, bend_lo, bend_hi)

@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from hhsr.kernels.cell import inverse_radius
+from hhsr.kernels.cut_cell import refine_cell
 from hhsr.kernels.descent import descend
 from hhsr.kernels.discs import BLOCK, DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment, lowest_bit
 from hhsr.kernels.facets import facet_cell
@@ -46,10 +47,9 @@ from hhsr.kernels.patch import (
     cell_bound,
     distance_to,
     offer,
-    refine_cell,
     set_spot,
 )
-from hhsr.kernels.quadratic import settle_square
+from hhsr.kernels.quadratic import settle_cell
 from hhsr.kernels.seeds import seed_at
 from hhsr.kernels.tree import into_leaf, turn_into_leaf, turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
@@ -85,10 +85,7 @@ def _settle(blob, ints, tab, code, search, local, corners, spare, rects):
     _into_own_frame(blob, ints, leaf, search, local)
     local[BEST] = search[BEST]
     o, face, a, b, half = facet_cell(ints, leaf, code)
-    # A facet that a cut touches is not parted here: beyond the cut no nearness is excluded.
-    if not np.float64(tab[o + THIRD]) < np.inf or not settle_square(
-        blob, ints, tab, leaf, planes, count, local, face, o, a, b, half, count == 0, rects
-    ):
+    if not settle_cell(blob, ints, tab, leaf, planes, count, local, face, o, a, b, half, rects):
         low = cell_bound(
             blob, ints, leaf, planes, count, local, face, a, b, half, np.float64(tab[o + VALUE]),
             np.float64(tab[o + SLOPE_A]), np.float64(tab[o + SLOPE_B]), np.float64(tab[o + ERROR]), corners, spare,

@@ -1,4 +1,4 @@
-"""A cell's surface against a point or a segment: bounded by its flat quad, settled by parting it.
+"""A cell's surface against a point or a segment: bounded by its flat quad.
 
 A search is a float array: its slots hold the segment and the best point so far.
 """
@@ -7,8 +7,7 @@ import math
 
 import numpy as np
 
-from hhsr.kernels.cell import cell_model, chart_of, direction_of, inverse_radius
-from hhsr.kernels.jet import inverse_radius_bend
+from hhsr.kernels.cell import chart_of, direction_of, inverse_radius
 from hhsr.kernels.layout import BOX
 from hhsr.kernels.maps import (
     cell_corners,
@@ -159,54 +158,3 @@ def cell_bound(blob, ints, leaf, planes, count, search, face, a, b, half, value,
     if low < search[BEST] - search[TOLERANCE]:
         offer_patch_point(blob, ints, leaf, planes, count, search, face, x, y, z, 2.0 * slant)
     return low
-
-
-@unmanaged
-def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, kink, third, corners, spare, rects):
-    """Part a cell until what is left of it can hold no nearer point. rects: (NODE_ROOM, 6) scratch.
-
-    Parts are bounded from their exact jet of second order and the cell's (kink, third); by proven models alone where
-    these are infinite.
-    """
-    jets = third < math.inf
-    rects[0, 0], rects[0, 1], rects[0, 2], rects[0, 3] = a, b, half, -1.0
-    depth = 1
-    while depth > 0:
-        depth -= 1
-        a, b, half, low = rects[depth, 0], rects[depth, 1], rects[depth, 2], rects[depth, 3]
-        if low > search[BEST] - search[TOLERANCE]:
-            continue
-        half *= 0.5
-        base = depth
-        for corner in range(4):
-            ca, cb = a + (half if corner & 1 else -half), b + (half if corner & 2 else -half)
-            w = 0.0
-            if jets:
-                w, ga, gb, waa, wab, wbb = inverse_radius_bend(blob, ints, leaf, face, ca, cb)
-                if w > 0.0:
-                    # Over the part W − tangent lies in half² [min(bend_lo, 0), max(bend_hi, 0)].
-                    middle, wide = 0.5 * (waa + wbb), math.sqrt(0.25 * (waa - wbb) ** 2 + wab * wab)
-                    wide += 2.0 * (kink + third * half * math.sqrt(2.0))
-                    up, down = half * half * max(middle + wide, 0.0), half * half * min(middle - wide, 0.0)
-                    value, error = w + 0.5 * (up + down), 0.5 * (up - down) + 1e-12 * w
-            if w == 0.0:
-                value, ga, gb, error, _, _, _, _, _, _, _, _ = cell_model(blob, ints, leaf, face, ca, cb, half, half)
-            low = cell_bound(
-                blob, ints, leaf, planes, count, search, face, ca, cb, half, value, ga, gb, error, corners, spare
-            )
-            if low > search[BEST] - search[TOLERANCE]:
-                continue
-            if half / value < FINEST:
-                x, y, z = direction_of(face, ca, cb)
-                if not outside_region(blob, planes, count, x / value, y / value, z / value, FINEST):
-                    distance, t = distance_to(search, x / value, y / value, z / value)
-                    offer(search, distance, t, x / value, y / value, z / value)
-                continue
-            # Insert so that the nearest is parted first.
-            k = depth
-            while k > base and rects[k - 1, 3] < low:
-                for q in range(4):
-                    rects[k, q] = rects[k - 1, q]
-                k -= 1
-            rects[k, 0], rects[k, 1], rects[k, 2], rects[k, 3] = ca, cb, half, low
-            depth += 1

@@ -17,7 +17,7 @@ import numpy as np
 
 from hhsr.kernels.cell import direction_of, inverse_radius
 from hhsr.kernels.jet import inverse_radius_bend
-from hhsr.kernels.layout import KINK, THIRD
+from hhsr.kernels.layout import BEND_AA, BEND_AB, BEND_BB, KINK, SLOPE_A, SLOPE_B, THIRD, VALUE
 from hhsr.kernels.maps import outside_region
 from hhsr.kernels.patch import BEST, FINEST, LENGTH2, NODE_ROOM, START, TOLERANCE, VECTOR, distance_to, offer
 from hhsr.kernels.unmanaged import unmanaged
@@ -117,16 +117,59 @@ def square_is_clear(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, 
 
 
 @unmanaged
-def settle_square(blob, ints, tab, leaf, planes, count, search, face, o, a, b, half, parting, rects):
-    """Settle a cell with jets (leaf's frame): offer its nearest point, or prove that it holds none.
+def _improves(blob, ints, leaf, planes, count, search, face, a, b):
+    """Offer the surface point over (a, b), if it lies in the region; return whether it is the best one now."""
+    x, y, z = direction_of(face, a, b)
+    m = 1.0 / inverse_radius(blob, ints, leaf, face, a, b)
+    x, y, z = x * m, y * m, z * m
+    distance, t = distance_to(search, x, y, z)
+    if not distance < search[BEST] or outside_region(blob, planes, count, x, y, z, 1e-9):
+        return False
+    offer(search, distance, t, x, y, z)
+    return True
 
-    o: the cell's float32 slot. count: planes of the region that may touch the cell. rects: (NODE_ROOM, 6) scratch.
-    Returns whether it could, without parting it unless `parting`; if not, nothing is proven.
+
+@unmanaged
+def settle_cell(blob, ints, tab, leaf, planes, count, search, face, o, a, b, half, rects):
+    """Settle a cell (leaf's frame): offer its nearest point, or prove that it holds none; return whether it could.
+
+    o: the cell's float32 slot. count: planes of the region that may touch the cell: such a one is not parted, for
+    beyond a cut no nearness is excluded. rects: (NODE_ROOM, 6) scratch.
+
+    Its own quadratic is in the table. W₀ and ∂W are right to 2e-7·W there: they are those of a surface that lies along
+    each ray within 1e-6·|x| of the true one.
     """
+    aa, ab, bb = np.float64(tab[o + BEND_AA]), np.float64(tab[o + BEND_AB]), np.float64(tab[o + BEND_BB])
     kink, third = np.float64(tab[o + KINK]), np.float64(tab[o + THIRD])
-    rects[0, 0], rects[0, 1], rects[0, 2] = a, b, half
-    depth = 1
-    whole = True
+    if math.isnan(aa) or not third < math.inf:
+        return False
+    w = np.float64(tab[o + VALUE]) - 0.25 * half * half * (aa + bb)
+    stray = 1e-6 * math.sqrt(1.0 + a * a + b * b) / w
+    for turn in range(2):
+        radius = min(search[BEST] - search[TOLERANCE], WIDEST)
+        if radius <= 0.0:
+            return True
+        clear, da, db = square_is_clear(
+            search, radius + stray, face, a, b, half, w, np.float64(tab[o + SLOPE_A]), np.float64(tab[o + SLOPE_B]),
+            aa, ab, bb, kink, third,
+        )  # fmt: skip
+        if clear:
+            return True
+        if turn == 1 or not _improves(blob, ints, leaf, planes, count, search, face, a + da, b + db):
+            break
+    if count > 0:
+        return False
+    # From here on the bounds are asked between any two points of the cell, not from its middle: twice as much.
+    return settle_parts(blob, ints, leaf, planes, count, search, face, a, b, half, 2.0 * kink, 2.0 * third, rects)
+
+
+@unmanaged
+def settle_parts(blob, ints, leaf, planes, count, search, face, a, b, half, kink, third, rects):
+    """Do as `settle_cell` by jets at the middles of the cell's quarters, and of theirs.
+
+    kink, third: ∂²W at two points of the cell differs by no more than kink + third times their distance.
+    """
+    depth = _part(rects, 0, a, b, half)
     while depth > 0:
         depth -= 1
         a, b, half = rects[depth, 0], rects[depth, 1], rects[depth, 2]
@@ -139,25 +182,23 @@ def settle_square(blob, ints, tab, leaf, planes, count, search, face, o, a, b, h
             if radius <= 0.0:
                 return True
             clear, da, db = square_is_clear(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third)
-            if clear or turn == 1:
+            if clear or turn == 1 or not _improves(blob, ints, leaf, planes, count, search, face, a + da, b + db):
                 break
-            x, y, z = direction_of(face, a + da, b + db)
-            m = 1.0 / inverse_radius(blob, ints, leaf, face, a + da, b + db)
-            x, y, z = x * m, y * m, z * m
-            distance, t = distance_to(search, x, y, z)
-            if not distance < search[BEST] or outside_region(blob, planes, count, x, y, z, 1e-9):
-                break
-            offer(search, distance, t, x, y, z)
-        if whole:  # its bounds are from its own middle: between two other points twice as much
-            kink, third, whole = 2.0 * kink, 2.0 * third, False
         if clear or half / w < FINEST:
             continue
-        if not parting or depth + 4 > NODE_ROOM:
+        if depth + 4 > NODE_ROOM:
             return False
-        half *= 0.5
-        for corner in range(4):
-            rects[depth, 0] = a + (half if corner & 1 else -half)
-            rects[depth, 1] = b + (half if corner & 2 else -half)
-            rects[depth, 2] = half
-            depth += 1
+        depth = _part(rects, depth, a, b, half)
     return True
+
+
+@unmanaged
+def _part(rects, depth, a, b, half):
+    """Push the four quarters of a square; return the new depth."""
+    half *= 0.5
+    for corner in range(4):
+        rects[depth, 0] = a + (half if corner & 1 else -half)
+        rects[depth, 1] = b + (half if corner & 2 else -half)
+        rects[depth, 2] = half
+        depth += 1
+    return depth

@@ -20,11 +20,9 @@ from hhsr.kernels.layout import (
     RANGE_TABLE,
     SLOPE_A,
     SLOPE_B,
-    SPREAD_A,
-    SPREAD_B,
     VALUE,
 )
-from hhsr.kernels.maps import bend_over, cell_at, level_start
+from hhsr.kernels.maps import bend_over, cell_at, level_start, spreads_of
 from hhsr.kernels.solve import share_to_t, solve_in_cell
 from hhsr.kernels.unmanaged import managed, unmanaged
 
@@ -228,16 +226,15 @@ def face_crossings(
                     split = _border(a0, b0, a1, b1, n << (word & 7))
                 if split < 0.0:
                     split = 0.5
-                    o, ca, cb, _ = cell_at(ints, leaf, face, a, b)
+                    o, ca, cb, half = cell_at(ints, leaf, face, a, b)
+                    sa, sb = spreads_of(tab, o, half)
                     verdict, state, count = _settle(
                         blob, ints, leaf, face, t0, a0, b0, w0, t1, a1, b1, w1,
-                        ca, cb, tab[o + VALUE], tab[o + SLOPE_A], tab[o + SLOPE_B], tab[o + ERROR], tab[o + SPREAD_A],
-                        tab[o + SPREAD_B], False, speed, resolution, tolerance, state, out, count,
+                        ca, cb, tab[o + VALUE], tab[o + SLOPE_A], tab[o + SLOPE_B], tab[o + ERROR], sa, sb,
+                        False, speed, resolution, tolerance, state, out, count,
                     )  # fmt: skip
                     if verdict == UNDECIDED:
-                        value, ga, gb, error, sa, sb, lo, hi, _, _, _, _ = cell_model(
-                            blob, ints, leaf, face, a, b, half_a, half_b
-                        )
+                        value, ga, gb, error, sa, sb = cell_model(blob, ints, leaf, face, a, b, half_a, half_b)[:6]
                         verdict, state, count = _settle(
                             blob, ints, leaf, face, t0, a0, b0, w0, t1, a1, b1, w1,
                             a, b, value, ga, gb, error, sa, sb, True, speed, resolution, tolerance, state, out, count,

@@ -30,11 +30,9 @@ from hhsr.kernels.layout import (
     PARTING,
     SLOPE_A,
     SLOPE_B,
-    SPREAD_A,
-    SPREAD_B,
     VALUE,
 )
-from hhsr.kernels.maps import plane_of
+from hhsr.kernels.maps import plane_of, spreads_of
 from hhsr.kernels.tree import into_leaf, turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
 
@@ -103,8 +101,9 @@ def _scan(ints, tab, leaf, face, a_lo, a_hi, b_lo, b_hi, gx, gy, gz, gather, acc
                     reach = 0.5 * (abs(da) * abs(high_a - low_a) + abs(db) * abs(high_b - low_b)) + tab[o + ERROR]
                     reach += 1e-11 * abs(value)
                     acc[0], acc[1] = min(acc[0], gap - reach), max(acc[1], gap + reach)
-                    acc[2] = max(acc[2], abs(da) + tab[o + SPREAD_A])
-                    acc[3] = max(acc[3], abs(db) + tab[o + SPREAD_B])
+                    stray_a, stray_b = spreads_of(tab, o, half)
+                    acc[2] = max(acc[2], abs(da) + stray_a)
+                    acc[3] = max(acc[3], abs(db) + stray_b)
     return count
 
 
