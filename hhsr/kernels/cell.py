@@ -51,6 +51,16 @@ def direction_of(face, a, b):
 
 
 @unmanaged
+def minor_parts(face, x, y, z):
+    """Return the parts of a vector along a face's minor axes, a and b."""
+    if face < 2:
+        return y, z
+    if face < 4:
+        return z, x
+    return x, y
+
+
+@unmanaged
 def chart_of(face, x, y, z):
     """Return (a, b, m) of a point on a given face: minor coordinates over the major one, and the major one."""
     if face < 2:
@@ -269,9 +279,9 @@ def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
     |W − value − slope·δ| ≤ error, |∂W − slope| ≤ spread, lo ≤ W ≤ hi, the eigenvalues of ∂²W lie in [bend_lo, bend_hi],
     and ∂²W differs from that at the centre by no more than kink + r·third at r from it (infinite where the base is no
     ellipsoid or the field may be capped): all proven on the whole rectangle about (a, b).
-    `value` is the middle of that strip, not W at the centre. (aa, ab, bb): ∂²W at the centre; then the slope is ∂W there,
-    and value W + (aa·half_a² + bb·half_b²)/4. NaN where it is not. The rectangle must lie within one block of directions
-    and straddle no coordinate plane.
+    `value` is the middle of that strip, not W at the centre. (aa, ab, bb): ∂²W at the centre; then the slope is ∂W
+    there, and value W + (aa·half_a² + bb·half_b²)/4. NaN where it is not. The rectangle must lie within one block of
+    directions and straddle no coordinate plane.
     """
     bend_lo, bend_hi, kink, third = -math.inf, math.inf, math.inf, math.inf
     bend_aa = bend_ab = bend_bb = math.nan

@@ -196,7 +196,7 @@ def _write(out, value, ga, gb, error, half, da, db, kink, third, aa, ab, bb):
 
 @unmanaged
 def spreads_of(tab, o, half):
-    """Return (spread_a, spread_b) of the cell at a float32 slot: how far ∂W strays from its slopes. half: its half side."""
+    """Return (spread_a, spread_b) of the cell at a float32 slot, of a half side: how far ∂W strays from its slopes."""
     aa, ab, bb = np.float64(tab[o + BEND_AA]), np.float64(tab[o + BEND_AB]), np.float64(tab[o + BEND_BB])
     if math.isnan(aa):
         return ab, bb

@@ -9,10 +9,10 @@ import math
 import numpy as np
 
 from hhsr.kernels.cell import inverse_radius
-from hhsr.kernels.cut_cell import refine_cell
 from hhsr.kernels.descent import descend
 from hhsr.kernels.discs import BLOCK, DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment, lowest_bit
 from hhsr.kernels.facets import facet_cell
+from hhsr.kernels.flat_cell import refine_cell
 from hhsr.kernels.foot import NEARBY, square_is_free
 from hhsr.kernels.layout import (
     ERROR,
@@ -20,7 +20,6 @@ from hhsr.kernels.layout import (
     FACET_COUNT,
     FACET_LEVELS,
     FRAME,
-    KINK,
     OWNER_INT_SIZE,
     OWNER_INTS,
     OWNER_PLANE_FLOATS,
@@ -29,7 +28,6 @@ from hhsr.kernels.layout import (
     SEED_FRAME,
     SLOPE_A,
     SLOPE_B,
-    THIRD,
     VALUE,
 )
 from hhsr.kernels.patch import (
@@ -49,8 +47,8 @@ from hhsr.kernels.patch import (
     offer,
     set_spot,
 )
-from hhsr.kernels.quadratic import settle_cell
 from hhsr.kernels.seeds import seed_at
+from hhsr.kernels.settle import settle_cell
 from hhsr.kernels.tree import into_leaf, turn_into_leaf, turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
 
@@ -85,16 +83,13 @@ def _settle(blob, ints, tab, code, search, local, corners, spare, rects):
     _into_own_frame(blob, ints, leaf, search, local)
     local[BEST] = search[BEST]
     o, face, a, b, half = facet_cell(ints, leaf, code)
-    if not settle_cell(blob, ints, tab, leaf, planes, count, local, face, o, a, b, half, rects):
+    if not settle_cell(blob, ints, tab, leaf, planes, count, local, face, o, a, b, half, corners, spare, rects):
         low = cell_bound(
             blob, ints, leaf, planes, count, local, face, a, b, half, np.float64(tab[o + VALUE]),
             np.float64(tab[o + SLOPE_A]), np.float64(tab[o + SLOPE_B]), np.float64(tab[o + ERROR]), corners, spare,
         )  # fmt: skip
         if low <= local[BEST] - search[TOLERANCE]:
-            refine_cell(
-                blob, ints, leaf, planes, count, local, face, a, b, half, np.float64(tab[o + KINK]),
-                np.float64(tab[o + THIRD]), corners, spare, rects,
-            )  # fmt: skip
+            refine_cell(blob, ints, leaf, planes, count, local, face, a, b, half, corners, spare, rects)
     if local[BEST] < search[BEST]:
         x, y, z = turn_out_of_leaf(blob, frame, local[FOOT], local[FOOT + 1], local[FOOT + 2])
         offer(search, local[BEST], local[BEST_T], x + blob[frame], y + blob[frame + 1], z + blob[frame + 2])

@@ -15,14 +15,9 @@ import math
 
 import numpy as np
 
-from hhsr.kernels.cell import direction_of, inverse_radius
-from hhsr.kernels.jet import inverse_radius_bend
-from hhsr.kernels.layout import BEND_AA, BEND_AB, BEND_BB, KINK, SLOPE_A, SLOPE_B, THIRD, VALUE
-from hhsr.kernels.maps import outside_region
-from hhsr.kernels.patch import BEST, FINEST, LENGTH2, NODE_ROOM, START, TOLERANCE, VECTOR, distance_to, offer
+from hhsr.kernels.cell import direction_of
+from hhsr.kernels.patch import LENGTH2, START, VECTOR
 from hhsr.kernels.unmanaged import unmanaged
-
-WIDEST = 1e60  # mm: no surface lies beyond, and its fourth power is still a number
 
 
 @unmanaged
@@ -57,11 +52,11 @@ def least_over_square(c, ca, cb, aa, ab, bb, half):
 
 
 @unmanaged
-def square_is_clear(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third):
-    """Return (clear, δa, δb): no surface over the square about (a, b) lies within `radius` of the search's segment.
+def bounding_quadratic(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third):
+    """Return (c, ca, cb, aa, ab, bb, slack) of a quadratic of δ: where it is > slack over the square about (a, b), no
+    surface over it lies within `radius` of the search's segment. Slack is infinite where W may vanish on the square.
 
-    All in the leaf's frame. (w, wa, …): exact jet there. δ: where the quadratic is least, a good guess of the nearest
-    point. Never clear where W may vanish on the square.
+    All in the leaf's frame. (w, wa, …): exact jet there.
     """
     x, y, z = direction_of(face, a, b)
     ell = math.sqrt(x * x + y * y + z * z)
@@ -75,7 +70,7 @@ def square_is_clear(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, 
     rest = kink + third * r / 3.0
     change = (math.sqrt(wa * wa + wb * wb) + 0.5 * (bend + rest) * r) * r
     if not change < 0.5 * w:
-        return False, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf
     vx, vy, vz = search[START] - x / w, search[START + 1] - y / w, search[START + 2] - z / w
     if search[LENGTH2] > 0.0:
         dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
@@ -108,97 +103,24 @@ def square_is_clear(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, 
     gap = away2 - radius * radius
     k = gap + 2.0 * along / w
     less = 0.5 * abs(k) * rest + longest * ell * (bend + rest) * r / (w * (w - change))
-    least, da, db = least_over_square(
-        w * gap, wa * gap - 2.0 * (va - fa * along), wb * gap - 2.0 * (vb - fb * along),
-        gaa * over + 0.5 * k * waa - less, gab * over + 0.5 * k * wab, gbb * over + 0.5 * k * wbb - less, half,
-    )  # fmt: skip
     slack = 1e-11 * (w + abs(wa) + abs(wb)) * (away2 + radius * radius)
+    return (
+        w * gap, wa * gap - 2.0 * (va - fa * along), wb * gap - 2.0 * (vb - fb * along),
+        gaa * over + 0.5 * k * waa - less, gab * over + 0.5 * k * wab, gbb * over + 0.5 * k * wbb - less, slack,
+    )  # fmt: skip
+
+
+@unmanaged
+def square_is_clear(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third):
+    """Return (clear, δa, δb): no surface over the square about (a, b) lies within `radius` of the search's segment.
+
+    All in the leaf's frame. (w, wa, …): exact jet there. δ: where the quadratic is least, a good guess of the nearest
+    point. Never clear where W may vanish on the square.
+    """
+    c, ca, cb, aa, ab, bb, slack = bounding_quadratic(
+        search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third
+    )
+    if slack == math.inf:
+        return False, 0.0, 0.0
+    least, da, db = least_over_square(c, ca, cb, aa, ab, bb, half)
     return least > slack, da, db
-
-
-@unmanaged
-def _improves(blob, ints, leaf, planes, count, search, face, a, b):
-    """Offer the surface point over (a, b), if it lies in the region; return whether it is the best one now."""
-    x, y, z = direction_of(face, a, b)
-    m = 1.0 / inverse_radius(blob, ints, leaf, face, a, b)
-    x, y, z = x * m, y * m, z * m
-    distance, t = distance_to(search, x, y, z)
-    if not distance < search[BEST] or outside_region(blob, planes, count, x, y, z, 1e-9):
-        return False
-    offer(search, distance, t, x, y, z)
-    return True
-
-
-@unmanaged
-def settle_cell(blob, ints, tab, leaf, planes, count, search, face, o, a, b, half, rects):
-    """Settle a cell (leaf's frame): offer its nearest point, or prove that it holds none; return whether it could.
-
-    o: the cell's float32 slot. count: planes of the region that may touch the cell: such a one is not parted, for
-    beyond a cut no nearness is excluded. rects: (NODE_ROOM, 6) scratch.
-
-    Its own quadratic is in the table. W₀ and ∂W are right to 2e-7·W there: they are those of a surface that lies along
-    each ray within 1e-6·|x| of the true one.
-    """
-    aa, ab, bb = np.float64(tab[o + BEND_AA]), np.float64(tab[o + BEND_AB]), np.float64(tab[o + BEND_BB])
-    kink, third = np.float64(tab[o + KINK]), np.float64(tab[o + THIRD])
-    if math.isnan(aa) or not third < math.inf:
-        return False
-    w = np.float64(tab[o + VALUE]) - 0.25 * half * half * (aa + bb)
-    stray = 1e-6 * math.sqrt(1.0 + a * a + b * b) / w
-    for turn in range(2):
-        radius = min(search[BEST] - search[TOLERANCE], WIDEST)
-        if radius <= 0.0:
-            return True
-        clear, da, db = square_is_clear(
-            search, radius + stray, face, a, b, half, w, np.float64(tab[o + SLOPE_A]), np.float64(tab[o + SLOPE_B]),
-            aa, ab, bb, kink, third,
-        )  # fmt: skip
-        if clear:
-            return True
-        if turn == 1 or not _improves(blob, ints, leaf, planes, count, search, face, a + da, b + db):
-            break
-    if count > 0:
-        return False
-    # From here on the bounds are asked between any two points of the cell, not from its middle: twice as much.
-    return settle_parts(blob, ints, leaf, planes, count, search, face, a, b, half, 2.0 * kink, 2.0 * third, rects)
-
-
-@unmanaged
-def settle_parts(blob, ints, leaf, planes, count, search, face, a, b, half, kink, third, rects):
-    """Do as `settle_cell` by jets at the middles of the cell's quarters, and of theirs.
-
-    kink, third: ∂²W at two points of the cell differs by no more than kink + third times their distance.
-    """
-    depth = _part(rects, 0, a, b, half)
-    while depth > 0:
-        depth -= 1
-        a, b, half = rects[depth, 0], rects[depth, 1], rects[depth, 2]
-        w, wa, wb, waa, wab, wbb = inverse_radius_bend(blob, ints, leaf, face, a, b)
-        if w == 0.0:
-            return False
-        clear = False
-        for turn in range(2):
-            radius = min(search[BEST] - search[TOLERANCE], WIDEST)
-            if radius <= 0.0:
-                return True
-            clear, da, db = square_is_clear(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third)
-            if clear or turn == 1 or not _improves(blob, ints, leaf, planes, count, search, face, a + da, b + db):
-                break
-        if clear or half / w < FINEST:
-            continue
-        if depth + 4 > NODE_ROOM:
-            return False
-        depth = _part(rects, depth, a, b, half)
-    return True
-
-
-@unmanaged
-def _part(rects, depth, a, b, half):
-    """Push the four quarters of a square; return the new depth."""
-    half *= 0.5
-    for corner in range(4):
-        rects[depth, 0] = a + (half if corner & 1 else -half)
-        rects[depth, 1] = b + (half if corner & 2 else -half)
-        rects[depth, 2] = half
-        depth += 1
-    return depth

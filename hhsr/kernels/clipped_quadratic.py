@@ -1,0 +1,83 @@
+"""A square of a leaf's directions that cuts part, against a point or a segment: the quadratic over the region's part.
+
+A cut n·p ≤ c is n·dir ≤ c·W in the chart: a line there, but for c times what W strays from its tangent.
+"""
+
+import math
+
+import numpy as np
+
+from hhsr.kernels.cell import direction_of, minor_parts
+from hhsr.kernels.polygon import clip_polygon
+from hhsr.kernels.quadratic import bounding_quadratic
+from hhsr.kernels.unmanaged import unmanaged
+
+ROUNDING = 1e-6  # what the table's float32 leave of a cut's place, relative
+
+
+@unmanaged
+def least_over_polygon(c, ca, cb, aa, ab, bb, corners, size):
+    """Return (least, a, b) of c + ca·a + cb·b + aa·a² + 2·ab·a·b + bb·b² over a convex polygon. corners: (size, 3)."""
+    det = aa * bb - ab * ab
+    if det > 0.0 and aa > 0.0:
+        a, b = 0.5 * (ab * cb - bb * ca) / det, 0.5 * (ab * ca - aa * cb) / det
+        left = right = False
+        for i in range(size):
+            j = i + 1 if i + 1 < size else 0
+            turn = (corners[j, 0] - corners[i, 0]) * (b - corners[i, 1])
+            turn -= (corners[j, 1] - corners[i, 1]) * (a - corners[i, 0])
+            left, right = left or turn > 0.0, right or turn < 0.0
+        if not (left and right):
+            return c + 0.5 * (ca * a + cb * b), a, b
+    least, where_a, where_b = np.inf, 0.0, 0.0
+    for i in range(size):
+        j = i + 1 if i + 1 < size else 0
+        a, b = corners[i, 0], corners[i, 1]
+        ua, ub = corners[j, 0] - a, corners[j, 1] - b
+        base = c + ca * a + cb * b + aa * a * a + 2.0 * ab * a * b + bb * b * b
+        linear = ca * ua + cb * ub + 2.0 * (aa * a * ua + ab * (a * ub + b * ua) + bb * b * ub)
+        square = aa * ua * ua + 2.0 * ab * ua * ub + bb * ub * ub
+        if square > 0.0:
+            x = min(max(-0.5 * linear / square, 0.0), 1.0)
+        elif linear + square < 0.0:
+            x = 1.0
+        else:
+            x = 0.0
+        value = base + (linear + square * x) * x
+        if value < least:
+            least, where_a, where_b = value, a + x * ua, b + x * ub
+    return least, where_a, where_b
+
+
+@unmanaged
+def clipped_is_clear(
+    blob, planes, count, search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third, corners, spare
+):
+    """Return (clear, δa, δb) as `square_is_clear` does, of the surface over the square that lies in a region.
+
+    planes, count: of the region, n·p ≤ c from a float slot on, leaf's frame. corners, spare: (ROOM, 3) scratch.
+    """
+    c, ca, cb, aa, ab, bb, slack = bounding_quadratic(
+        search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third
+    )
+    if slack == np.inf:
+        return False, 0.0, 0.0
+    for corner in range(4):
+        corners[corner, 0] = half if corner == 1 or corner == 2 else -half
+        corners[corner, 1] = half if corner >= 2 else -half
+        corners[corner, 2] = 0.0
+    size = np.int64(4)
+    x, y, z = direction_of(face, a, b)
+    bend = 0.5 * abs(waa + wbb) + math.sqrt(0.25 * (waa - wbb) ** 2 + wab * wab)
+    strays = (bend + kink + third * half * math.sqrt(2.0) / 3.0) * half * half
+    for k in range(count):
+        o = planes + 4 * k
+        nx, ny, nz, place = blob[o], blob[o + 1], blob[o + 2], blob[o + 3]
+        along = nx * x + ny * y + nz * z
+        na, nb = minor_parts(face, nx, ny, nz)
+        room = abs(place) * strays + ROUNDING * (abs(along) + abs(place) * w) - (along - place * w)
+        size = clip_polygon(corners, size, spare, na - place * wa, nb - place * wb, 0.0, room)
+        if size == 0:
+            return True, 0.0, 0.0
+    least, da, db = least_over_polygon(c, ca, cb, aa, ab, bb, corners, size)
+    return least > slack, da, db

@@ -1,0 +1,139 @@
+"""A cell of a leaf's surface settled against a search: its nearest point offered, or proven that it holds none.
+
+Most are by the quadratic in the table; others are parted, each part by its exact jet.
+"""
+
+import math
+
+import numpy as np
+
+from hhsr.kernels.cell import direction_of, inverse_radius, minor_parts
+from hhsr.kernels.clipped_quadratic import clipped_is_clear
+from hhsr.kernels.jet import inverse_radius_bend
+from hhsr.kernels.layout import BEND_AA, BEND_AB, BEND_BB, KINK, SLOPE_A, SLOPE_B, THIRD, VALUE
+from hhsr.kernels.maps import outside_region
+from hhsr.kernels.patch import BEST, FINEST, NODE_ROOM, TOLERANCE, distance_to, offer
+from hhsr.kernels.quadratic import square_is_clear
+from hhsr.kernels.unmanaged import unmanaged
+
+WIDEST = 1e60  # mm: no surface lies beyond, and its fourth power is still a number
+ASIDE = 0.02  # tolerances: how far from a cut a point is offered that would lie beyond it
+MOVES = 5
+
+
+@unmanaged
+def _improves(blob, ints, leaf, planes, count, search, face, a, b, wa, wb):
+    """Offer the surface point over (a, b), moved into the region where W has the slopes (wa, wb); return whether it is
+    the best one now.
+    """
+    for _ in range(MOVES):
+        w = inverse_radius(blob, ints, leaf, face, a, b)
+        x, y, z = direction_of(face, a, b)
+        distance, t = distance_to(search, x / w, y / w, z / w)
+        if not distance < search[BEST]:
+            return False
+        worst, at = 1e-9, -1
+        for k in range(count):
+            o = planes + 4 * k
+            excess = (blob[o] * x + blob[o + 1] * y + blob[o + 2] * z) / w - blob[o + 3]
+            if excess > worst:
+                worst, at = excess, o
+        if at < 0:
+            offer(search, distance, t, x / w, y / w, z / w)
+            return True
+        na, nb = minor_parts(face, blob[at], blob[at + 1], blob[at + 2])
+        na, nb = na - blob[at + 3] * wa, nb - blob[at + 3] * wb
+        step = (worst + ASIDE * search[TOLERANCE]) * w / (na * na + nb * nb)
+        a, b = a - step * na, b - step * nb
+        if not max(abs(a), abs(b)) <= 1.0:
+            return False
+    return False
+
+
+@unmanaged
+def _is_clear(
+    blob, planes, count, search, stray, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third, corners, spare
+):
+    """Return (clear, δa, δb) of the part of a square that lies in the region: `square_is_clear`."""
+    radius = min(search[BEST] - search[TOLERANCE], WIDEST)
+    if radius <= 0.0:
+        return True, 0.0, 0.0
+    if count == 0:
+        return square_is_clear(search, radius + stray, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third)
+    return clipped_is_clear(
+        blob, planes, count, search, radius + stray, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third, corners,
+        spare,
+    )  # fmt: skip
+
+
+@unmanaged
+def settle_cell(blob, ints, tab, leaf, planes, count, search, face, o, a, b, half, corners, spare, rects):
+    """Settle a cell (leaf's frame): offer its nearest point, or prove that it holds none; return whether it could.
+
+    o: the cell's float32 slot. count: planes of the region that may touch the cell. corners, spare: (ROOM, 3), rects:
+    (NODE_ROOM, 6), scratch.
+
+    W₀ and ∂W of the table are right to 2e-7·W: they are those of a surface that lies along each ray within 1e-6·|x| of
+    the true one.
+    """
+    aa, ab, bb = np.float64(tab[o + BEND_AA]), np.float64(tab[o + BEND_AB]), np.float64(tab[o + BEND_BB])
+    kink, third = np.float64(tab[o + KINK]), np.float64(tab[o + THIRD])
+    if math.isnan(aa) or not third < math.inf:
+        return False
+    w = np.float64(tab[o + VALUE]) - 0.25 * half * half * (aa + bb)
+    sa, sb = np.float64(tab[o + SLOPE_A]), np.float64(tab[o + SLOPE_B])
+    stray = 1e-6 * math.sqrt(1.0 + a * a + b * b) / w
+    for turn in range(2):
+        clear, da, db = _is_clear(
+            blob, planes, count, search, stray, face, a, b, half, w, sa, sb, aa, ab, bb, kink, third,
+            corners, spare,
+        )  # fmt: skip
+        if clear:
+            return True
+        if turn == 1 or not _improves(blob, ints, leaf, planes, count, search, face, a + da, b + db, sa, sb):
+            break
+    # From here on the bounds are asked between any two points of the cell, not from its middle: twice as much.
+    kink, third = 2.0 * kink, 2.0 * third
+    depth = _part(rects, 0, a, b, half)
+    while depth > 0:
+        depth -= 1
+        a, b, half = rects[depth, 0], rects[depth, 1], rects[depth, 2]
+        w, wa, wb, waa, wab, wbb = inverse_radius_bend(blob, ints, leaf, face, a, b)
+        if w == 0.0:
+            return False
+        clear = False
+        for turn in range(2):
+            clear, da, db = _is_clear(
+                blob, planes, count, search, 0.0, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third, corners,
+                spare,
+            )  # fmt: skip
+            if (
+                clear
+                or turn == 1
+                or not _improves(blob, ints, leaf, planes, count, search, face, a + da, b + db, wa, wb)
+            ):
+                break
+        if clear:
+            continue
+        if half / w < FINEST:
+            x, y, z = direction_of(face, a, b)
+            if not outside_region(blob, planes, count, x / w, y / w, z / w, FINEST):
+                distance, t = distance_to(search, x / w, y / w, z / w)
+                offer(search, distance, t, x / w, y / w, z / w)
+            continue
+        if depth + 4 > NODE_ROOM:
+            return False
+        depth = _part(rects, depth, a, b, half)
+    return True
+
+
+@unmanaged
+def _part(rects, depth, a, b, half):
+    """Push the four quarters of a square; return the new depth."""
+    half *= 0.5
+    for corner in range(4):
+        rects[depth, 0] = a + (half if corner & 1 else -half)
+        rects[depth, 1] = b + (half if corner & 2 else -half)
+        rects[depth, 2] = half
+        depth += 1
+    return depth
