@@ -19,21 +19,23 @@ from hhsr.kernels.layout import (
     OWNER_PLANES,
     OWNER_RECORD,
 )
-from hhsr.kernels.maps import outside_region, plane_of
+from hhsr.kernels.maps import jet_near, outside_region, plane_of
 from hhsr.kernels.patch import BEST, START, TOLERANCE, offer, set_spot
 from hhsr.kernels.tree import into_leaf, owner_of, turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
 
 STEPS = 10
+ROUGH = 2  # of them by the table
 
 
 @unmanaged
-def descend(blob, ints, owner, face, a, b, search):
+def descend(blob, ints, tab, owner, face, a, b, search):
     """Offer the surface points on a way of steepest nearing from (a, b) of an owner; return whether it came to a foot.
 
-    search: of a point, tree's frame.
+    search: of a point, tree's frame. The first steps are the table's: no point of theirs is on the surface.
     """
     last = np.inf
+    rough = ROUGH
     for _ in range(STEPS):
         o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
         leaf = ints[o + OWNER_RECORD]
@@ -42,15 +44,19 @@ def descend(blob, ints, owner, face, a, b, search):
         planes, count = ints[o + OWNER_PLANE_FLOATS], ints[o + OWNER_PLANES]
         frame = ints[leaf + FRAME]
         px, py, pz = into_leaf(blob, ints, leaf, search[START], search[START + 1], search[START + 2])
-        w, wa, wb, waa, wab, wbb = inverse_radius_bend(blob, ints, leaf, face, a, b)
-        if w == 0.0:
-            return False
+        w, wa, wb, waa, wab, wbb = jet_near(tab, ints, leaf, face, a, b)
+        rough -= 1
+        if rough < 0 or not w > 0.0:
+            rough = -1
+            w, wa, wb, waa, wab, wbb = inverse_radius_bend(blob, ints, leaf, face, a, b)
+            if w == 0.0:
+                return False
         m = 1.0 / w
         x, y, z = direction_of(face, a, b)
         x, y, z = x * m, y * m, z * m
         rx, ry, rz = px - x, py - y, pz - z
         distance = math.sqrt(rx * rx + ry * ry + rz * rz)
-        within = not outside_region(blob, planes, count, x, y, z, 1e-9)
+        within = rough < 0 and not outside_region(blob, planes, count, x, y, z, 1e-9)
         if within and distance < search[BEST]:
             ox, oy, oz = turn_out_of_leaf(blob, frame, x, y, z)
             offer(search, distance, 0.0, ox + blob[frame], oy + blob[frame + 1], oz + blob[frame + 2])
@@ -85,7 +91,8 @@ def descend(blob, ints, owner, face, a, b, search):
             move = 0.25
         if within and move > 0.9 * last:
             return False
-        last = move
+        if rough < 0:
+            last = move
         a, b = a + da, b + db
         w += wa * da + wb * db
         if not w > 0.0:

@@ -30,7 +30,7 @@ from hhsr.kernels.layout import (
     integers,
     tables,
 )
-from hhsr.kernels.nearest import nearest_on_leaves, owner_planes, seed_point
+from hhsr.kernels.nearest import nearest_on_leaves, owner_planes, seed_point, seeds_beside
 from hhsr.kernels.nearest_part import box_bound, nearest_on_part
 from hhsr.kernels.nearest_slab import nearest_on_slab
 from hhsr.kernels.patch import (
@@ -47,6 +47,7 @@ from hhsr.kernels.patch import (
     START,
     TOLERANCE,
     VECTOR,
+    distance_to,
     offer,
 )
 from hhsr.kernels.polygon import ROOM, segment_to_segment
@@ -204,6 +205,13 @@ def nearest_many(blob, points, order, tolerance, distance, foot):
 
 
 @unmanaged
+def _offer_known(search, x, y, z):
+    """Offer a surface point to a search about a point."""
+    distance, t = distance_to(search, x, y, z)
+    offer(search, distance, t, x, y, z)
+
+
+@unmanaged
 def _highest(px, py, pz, dx, dy, dz, t0, t1, ax, ay, az, bx, by, bz):
     """Return the greatest min(|p(t) − a|, |p(t) − b|)² on [t0, t1], and its t: an upper bound of the distance²."""
     dd = dx * dx + dy * dy + dz * dz
@@ -278,7 +286,7 @@ def deepest(
         if not (on0 if k == 0 else on1):
             # Some surface point will do: if the bound is highest here, the true distance is asked below.
             set_search(search, x, y, z, 0.0, 0.0, 0.0, ROUGHLY * tolerance)
-            seed_point(blob, ints, search)
+            seed_point(blob, ints, tab, search)
             if search[BEST] == FAR:
                 search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
             x, y, z = search[FOOT], search[FOOT + 1], search[FOOT + 2]
@@ -301,28 +309,15 @@ def deepest(
         b, bx, by, bz = spans[s, 4], spans[s, 5], spans[s, 6], spans[s, 7]
         set_search(search, px + t * dx, py + t * dy, pz + t * dz, 0.0, 0.0, 0.0, ROUGHLY * tolerance)
         if a < t < b:
-            seed_point(blob, ints, search)
+            seed_point(blob, ints, tab, search)
         if not search[BEST] < value - near:
-            # Nothing nearer is known, or the bound is highest where a point already found is the nearest known: what is
-            # the true distance there?
+            _offer_known(search, ax, ay, az)
+            _offer_known(search, bx, by, bz)
+            seeds_beside(blob, ints, tab, value - near, search)
+        if not search[BEST] < value - near:
+            # Nothing nearer is known: what is the true distance there?
             room = 0.9 * tolerance - max(value - search[BEST], 0.0)
             search[TOLERANCE] = room
-            offer(
-                search,
-                math.sqrt((px + t * dx - ax) ** 2 + (py + t * dy - ay) ** 2 + (pz + t * dz - az) ** 2),
-                0.0,
-                ax,
-                ay,
-                az,
-            )
-            offer(
-                search,
-                math.sqrt((px + t * dx - bx) ** 2 + (py + t * dy - by) ** 2 + (pz + t * dz - bz) ** 2),
-                0.0,
-                bx,
-                by,
-                bz,
-            )
             search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
             if search[BEST] - room > sure:
                 sure = search[BEST] - room

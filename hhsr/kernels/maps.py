@@ -70,6 +70,24 @@ def cell_at(ints, leaf, face, a, b):
 
 
 @unmanaged
+def jet_of(tab, o, half):
+    """Return (W, W_a, W_b, W_aa, W_ab, W_bb) at the middle of the cell at a float32 slot, to 2e-7·W; NaN: unknown."""
+    aa, ab, bb = np.float64(tab[o + BEND_AA]), np.float64(tab[o + BEND_AB]), np.float64(tab[o + BEND_BB])
+    w = np.float64(tab[o + VALUE]) - 0.25 * half * half * (aa + bb)
+    return w, np.float64(tab[o + SLOPE_A]), np.float64(tab[o + SLOPE_B]), aa, ab, bb
+
+
+@unmanaged
+def jet_near(tab, ints, leaf, face, a, b):
+    """Return the jet at (a, b) by the table, W to third order; NaN where it has none."""
+    o, ca, cb, half = cell_at(ints, leaf, face, a, b)
+    w, wa, wb, aa, ab, bb = jet_of(tab, o, half)
+    da, db = a - ca, b - cb
+    ra, rb = aa * da + ab * db, ab * da + bb * db
+    return w + (wa + 0.5 * ra) * da + (wb + 0.5 * rb) * db, wa + ra, wb + rb, aa, ab, bb
+
+
+@unmanaged
 def bend_over(tab, ints, leaf, face, i0, i1, j0, j1):
     """Return the range of the eigenvalues of ∂²W over base cells i0 … i1, j0 … j1 of a face."""
     n = ints[leaf + CELLS]

@@ -47,7 +47,7 @@ from hhsr.kernels.patch import (
     offer,
     set_spot,
 )
-from hhsr.kernels.seeds import seed_at
+from hhsr.kernels.seeds import seed_at, seed_beside
 from hhsr.kernels.settle import settle_cell
 from hhsr.kernels.tree import into_leaf, turn_into_leaf, turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
@@ -96,18 +96,39 @@ def _settle(blob, ints, tab, code, search, local, corners, spare, rects):
 
 
 @unmanaged
-def seed_point(blob, ints, search):
+def seed_point(blob, ints, tab, search):
     """Offer surface points on the way down from the facet that is named near the search's point; nothing is proven."""
     if ints[FACET_COUNT] == 0:
         return
-    code = ints[ints[FACET_CODES] + seed_at(blob, ints, search[START], search[START + 1], search[START + 2])]
-    leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * (code >> 24) + OWNER_RECORD]
-    _, face, a, b, _ = facet_cell(ints, leaf, code)
-    descend(blob, ints, code >> 24, face, a, b, search)
+    _descend_from(blob, ints, tab, seed_at(blob, ints, search[START], search[START + 1], search[START + 2]), search)
 
 
 @unmanaged
-def _seed_segment(blob, ints, search, local):
+def _descend_from(blob, ints, tab, facet, search):
+    code = ints[ints[FACET_CODES] + facet]
+    leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * (code >> 24) + OWNER_RECORD]
+    _, face, a, b, _ = facet_cell(ints, leaf, code)
+    descend(blob, ints, tab, code >> 24, face, a, b, search)
+
+
+@unmanaged
+def seeds_beside(blob, ints, tab, below, search):
+    """Do as `seed_point` from those facets named beside the point whose middles are nearer than `below`."""
+    if ints[FACET_COUNT] == 0:
+        return
+    x, y, z = search[START], search[START + 1], search[START + 2]
+    levels = ints[FACET_LEVELS]
+    first = ints[levels + 1 + 2 * ints[levels]]
+    for way in range(6):
+        facet = seed_beside(blob, ints, x, y, z, way)
+        o = first + BLOCK * (facet // WIDE) + facet % WIDE
+        rx, ry, rz = x - tab[o], y - tab[o + WIDE], z - tab[o + 2 * WIDE]
+        if rx * rx + ry * ry + rz * rz < min(below, search[BEST]) ** 2:
+            _descend_from(blob, ints, tab, facet, search)
+
+
+@unmanaged
+def _seed_segment(blob, ints, tab, search, local):
     """Offer a surface point near the search's segment: the nearest of a few points', then to and fro between both."""
     local[LENGTH2], local[TOLERANCE] = 0.0, search[TOLERANCE]
     t = 0.0
@@ -121,7 +142,7 @@ def _seed_segment(blob, ints, search, local):
         for q in range(3):
             local[START + q] = search[START + q] + t * search[VECTOR + q]
         local[BEST], local[SPOT] = FAR, -1.0
-        seed_point(blob, ints, local)
+        seed_point(blob, ints, tab, local)
         if local[BEST] < FAR:
             distance, t = distance_to(search, local[FOOT], local[FOOT + 1], local[FOOT + 2])
             if distance < search[BEST]:
@@ -177,9 +198,9 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
     own, free = _free_about(blob, ints, tab, search, local)
     if free == 0.0:
         if moving:
-            _seed_segment(blob, ints, search, local)
+            _seed_segment(blob, ints, tab, search, local)
         else:
-            seed_point(blob, ints, search)
+            seed_point(blob, ints, tab, search)
         own, free = _free_about(blob, ints, tab, search, local)
     x, y, z = search[START], search[START + 1], search[START + 2]
     dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]

@@ -10,8 +10,8 @@ import numpy as np
 from hhsr.kernels.cell import direction_of, inverse_radius, minor_parts
 from hhsr.kernels.clipped_quadratic import clipped_is_clear
 from hhsr.kernels.jet import inverse_radius_bend
-from hhsr.kernels.layout import BEND_AA, BEND_AB, BEND_BB, KINK, SLOPE_A, SLOPE_B, THIRD, VALUE
-from hhsr.kernels.maps import outside_region
+from hhsr.kernels.layout import KINK, THIRD
+from hhsr.kernels.maps import jet_of, outside_region
 from hhsr.kernels.patch import BEST, FINEST, NODE_ROOM, TOLERANCE, distance_to, offer
 from hhsr.kernels.quadratic import square_is_clear
 from hhsr.kernels.unmanaged import unmanaged
@@ -73,15 +73,12 @@ def settle_cell(blob, ints, tab, leaf, planes, count, search, face, o, a, b, hal
     o: the cell's float32 slot. count: planes of the region that may touch the cell. corners, spare: (ROOM, 3), rects:
     (NODE_ROOM, 6), scratch.
 
-    W₀ and ∂W of the table are right to 2e-7·W: they are those of a surface that lies along each ray within 1e-6·|x| of
-    the true one.
+    The table's jet is that of a surface that lies along each ray within 1e-6·|x| of the true one.
     """
-    aa, ab, bb = np.float64(tab[o + BEND_AA]), np.float64(tab[o + BEND_AB]), np.float64(tab[o + BEND_BB])
+    w, sa, sb, aa, ab, bb = jet_of(tab, o, half)
     kink, third = np.float64(tab[o + KINK]), np.float64(tab[o + THIRD])
-    if math.isnan(aa) or not third < math.inf:
+    if math.isnan(w) or not third < math.inf:
         return False
-    w = np.float64(tab[o + VALUE]) - 0.25 * half * half * (aa + bb)
-    sa, sb = np.float64(tab[o + SLOPE_A]), np.float64(tab[o + SLOPE_B])
     stray = 1e-6 * math.sqrt(1.0 + a * a + b * b) / w
     for turn in range(2):
         clear, da, db = _is_clear(
