@@ -26,7 +26,7 @@ from hhsr.kernels.layout import (
     SLOPE_B,
     VALUE,
 )
-from hhsr.kernels.maps import level_start, plane_of
+from hhsr.kernels.maps import index_of, level_start, plane_of
 from hhsr.kernels.part import TRIANGLES, part_arrays
 from hhsr.kernels.tree import into_leaf, owner_contains
 from hhsr.kernels.unmanaged import managed, unmanaged
@@ -34,12 +34,6 @@ from hhsr.kernels.unmanaged import managed, unmanaged
 OUT, IN, MIXED = 0, 1, 2
 SPAN = 3  # cells a side that are looked at one by one
 SLACK = 1e-6  # mm that a box is grown by on all sides
-
-
-@unmanaged
-def index_of(x, side):
-    """Return the cell, of `side` over [−1, 1], that holds x."""
-    return min(max(int((x + 1.0) * 0.5 * side), 0), side - 1)
 
 
 @unmanaged

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from hhsr.kernels.box_state import directions_of, index_of
+from hhsr.kernels.box_state import directions_of
 from hhsr.kernels.cell import axis_scale, chart_of, direction_of, face_of
 from hhsr.kernels.jet import has_jets, inverse_radius_bend, inverse_radius_jet
 from hhsr.kernels.layout import (
@@ -26,7 +26,7 @@ from hhsr.kernels.layout import (
     SLOPE_B,
     VALUE,
 )
-from hhsr.kernels.maps import bend_over, cell_at, plane_of, rests_over
+from hhsr.kernels.maps import bend_over, cell_at, index_of, plane_of, rests_over
 from hhsr.kernels.patch import FOOT, LENGTH2, SIDE, START, set_spot
 from hhsr.kernels.quadratic import square_is_clear
 from hhsr.kernels.unmanaged import unmanaged
@@ -88,11 +88,7 @@ def square_is_free(blob, ints, tab, leaf, local, radius, face, a, b, half):
     """Return whether no surface over the square about (a, b) lies nearer to the search's segment: by the jet there."""
     if max(abs(a), abs(b)) + half > 1.0:
         return False
-    n = ints[leaf + CELLS]
-    kink, third = rests_over(
-        tab, ints, leaf, face, index_of(a - half, n), index_of(a + half, n), index_of(b - half, n),
-        index_of(b + half, n),
-    )  # fmt: skip
+    kink, third = rests_over(tab, ints, leaf, face, a - half, a + half, b - half, b + half)
     if not third < np.inf:
         return False
     w, wa, wb, waa, wab, wbb = inverse_radius_bend(blob, ints, leaf, face, a, b)

@@ -56,6 +56,12 @@ def pyramid_size(cells):
 
 
 @unmanaged
+def index_of(x, side):
+    """Return the cell, of `side` over [−1, 1], that holds x."""
+    return min(max(int((x + 1.0) * 0.5 * side), 0), side - 1)
+
+
+@unmanaged
 def cell_at(ints, leaf, face, a, b):
     """Return (slot, a, b, half) of the cell that holds (a, b): its float32 slot, its centre and half its side."""
     n = ints[leaf + CELLS]
@@ -100,18 +106,28 @@ def bend_over(tab, ints, leaf, face, i0, i1, j0, j1):
 
 
 @unmanaged
-def rests_over(tab, ints, leaf, face, i0, i1, j0, j1):
-    """Return (kink, third): ∂²W at two points of base cells i0 … i1, j0 … j1 of a face differs by no more than
-    kink + third times their distance.
+def rests_over(tab, ints, leaf, face, a0, a1, b0, b1):
+    """Return (kink, third): ∂²W at two points of a rectangle of a face differs by no more than kink + third times their
+    distance.
     """
     n = ints[leaf + CELLS]
     kink = third = 0.0
-    for i in range(i0, i1 + 1):
-        for j in range(j0, j1 + 1):
-            q = ints[leaf + BEND_TABLE] + BEND_SIZE * ((face * n + i) * n + j)
-            kink, third = max(kink, np.float64(tab[q + 2])), max(third, np.float64(tab[q + 3]))
+    finest = 1
+    for i in range(index_of(a0, n), index_of(a1, n) + 1):
+        for j in range(index_of(b0, n), index_of(b1, n) + 1):
+            word = ints[ints[leaf + PARTING] + (face * n + i) * n + j]
+            s = 1 << (word & 7)
+            finest = max(finest, s)
+            p0, p1 = max(index_of(a0, n * s) - i * s, 0), min(index_of(a1, n * s) - i * s, s - 1)
+            q0, q1 = max(index_of(b0, n * s) - j * s, 0), min(index_of(b1, n * s) - j * s, s - 1)
+            for p in range(p0, p1 + 1):
+                o = ints[leaf + CELL_TABLE] + CELL_SIZE * ((word >> 4) + p * s)
+                for c in range(o + CELL_SIZE * q0, o + CELL_SIZE * q1 + 1, CELL_SIZE):
+                    kink, third = max(kink, np.float64(tab[c + KINK])), max(third, np.float64(tab[c + THIRD]))
+    side = n * finest
+    lines = index_of(a1, side) - index_of(a0, side) + index_of(b1, side) - index_of(b0, side)
     # A cell's are from its own middle: between two other points twice as much. A line passes so many of them.
-    return 2.0 * (i1 - i0 + j1 - j0 + 1) * kink, 2.0 * third
+    return 2.0 * (lines + 1) * kink, 2.0 * third
 
 
 @unmanaged

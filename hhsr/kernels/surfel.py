@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from hhsr.kernels.box_state import IN, MIXED, OUT, SLACK, directions_of, index_of, leaf_box_state
+from hhsr.kernels.box_state import IN, MIXED, OUT, SLACK, directions_of, leaf_box_state
 from hhsr.kernels.layout import (
     BEND_SIZE,
     BEND_TABLE,
@@ -32,7 +32,7 @@ from hhsr.kernels.layout import (
     SLOPE_B,
     VALUE,
 )
-from hhsr.kernels.maps import plane_of, spreads_of
+from hhsr.kernels.maps import index_of, plane_of, spreads_of
 from hhsr.kernels.tree import into_leaf, turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
 

@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 from hhsr.batches import neighbours_first
 from hhsr.compiled import compile_tree
 from hhsr.kernels import layout as at
-from hhsr.kernels.box_state import index_of
 from hhsr.kernels.cell import direction_of, inverse_radius
 from hhsr.kernels.discs import DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment, lowest_bit
 from hhsr.kernels.facets import _along_curve, facet_cell
@@ -141,10 +140,8 @@ def test_second_derivatives_change_no_more_over_many_cells(one: ModelLeaf) -> No
     seen = 0
     for blob, record, (_, face, a, b, _) in facets(one, 80, rng):
         ints, tab = integers(blob), tables(blob)
-        n = ints[record + at.CELLS]
         half = min(rng.choice([0.01, 0.05, 0.12]), 1.0 - max(abs(a), abs(b)))
-        window = [index_of(x, n) for x in (a - half, a + half, b - half, b + half)]
-        kink, third = rests_over(tab, ints, record, face, *window)
+        kink, third = rests_over(tab, ints, record, face, a - half, a + half, b - half, b + half)
         jet = np.array(inverse_radius_bend(blob, ints, record, face, a, b))
         if not np.isfinite(third) or jet[0] == 0.0:
             continue
