@@ -4,16 +4,12 @@ A disc of the facets' hierarchy is discarded when it lies no nearer than the bes
 its flat quad, widened by its proven thickness, does; what is left is settled at the end.
 """
 
-import math
-
 import numpy as np
 
-from hhsr.kernels.cell import inverse_radius
 from hhsr.kernels.descent import descend
 from hhsr.kernels.discs import BLOCK, DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment, lowest_bit
 from hhsr.kernels.facets import facet_cell
 from hhsr.kernels.flat_cell import refine_cell
-from hhsr.kernels.foot import NEARBY, square_is_free
 from hhsr.kernels.layout import (
     ERROR,
     FACET_CODES,
@@ -55,8 +51,6 @@ from hhsr.kernels.unmanaged import unmanaged
 VAST = 1e9  # mm
 ROUNDING = 1e-9  # of the coordinates
 PATIENCE = 16  # facets that may wait
-WIDEST = 0.125  # half side, in the chart, of the first square about a foot that is tried
-TRIES = 3
 SAMPLES = 4  # points of a segment that ask for a seed
 
 
@@ -151,38 +145,6 @@ def _seed_segment(blob, ints, tab, search, local):
 
 
 @unmanaged
-def _free_about(blob, ints, tab, search, local):
-    """Return (owner, radius): within it of the search's foot no surface of that leaf lies nearer than the foot.
-
-    No nearer: by no more than the tolerance. Radius: mm, 0 where nothing is proven, or the best point is no foot.
-    """
-    owner, radius = int(search[SPOT]), search[BEST] - search[TOLERANCE]
-    if owner < 0 or radius <= 0.0:
-        return np.int64(-1), 0.0
-    leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * owner + OWNER_RECORD]
-    face, a, b = int(search[SPOT + 1]), search[SPOT + 2], search[SPOT + 3]
-    m = 1.0 / inverse_radius(blob, ints, leaf, face, a, b)
-    if radius > NEARBY * m:
-        return np.int64(-1), 0.0
-    _into_own_frame(blob, ints, leaf, search, local)
-    half = min(WIDEST, 1.0 - max(abs(a), abs(b)))
-    for _ in range(TRIES):
-        if square_is_free(blob, ints, tab, leaf, local, radius, face, a, b, half):
-            # |a′ − a| ≤ R √(1 + a²)/(m − R) of a point no farther than R from one with major coordinate m.
-            return np.int64(owner), half * m / (math.sqrt(1.0 + max(a * a, b * b)) + half) * (1.0 - 1e-9)
-        half *= 0.5
-    return np.int64(-1), 0.0
-
-
-@unmanaged
-def _lies_in(blocks, i, c, x, y, z, radius):
-    """Return whether disc c of a block lies wholly in a ball."""
-    rx, ry, rz = blocks[i, 0, c] - x, blocks[i, 1, c] - y, blocks[i, 2, c] - z
-    rest = radius - blocks[i, 6, c] - blocks[i, 7, c]
-    return rest > 0.0 and rx * rx + ry * ry + rz * rz <= rest * rest
-
-
-@unmanaged
 def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spare, rects):
     """Improve the search (tree's frame) by the surface of all model leaves, each within its region.
 
@@ -195,13 +157,10 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
     moving = search[LENGTH2] > 0.0
     local[VECTOR], local[VECTOR + 1], local[VECTOR + 2] = 0.0, 0.0, 0.0
     local[TOLERANCE] = search[TOLERANCE]
-    own, free = _free_about(blob, ints, tab, search, local)
-    if free == 0.0:
-        if moving:
-            _seed_segment(blob, ints, tab, search, local)
-        else:
-            seed_point(blob, ints, tab, search)
-        own, free = _free_about(blob, ints, tab, search, local)
+    if moving:
+        _seed_segment(blob, ints, tab, search, local)
+    else:
+        seed_point(blob, ints, tab, search)
     x, y, z = search[START], search[START + 1], search[START + 2]
     dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
     first = ints[levels + 1 + 2 * ints[levels]]
@@ -213,8 +172,6 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
     local[LENGTH2], local[TOLERANCE] = search[LENGTH2], search[TOLERANCE]
     loose = LOOSE * (reach + blob[ints[SEED_FRAME] + 4])
     limit = search[BEST] - search[TOLERANCE]
-    free -= 2.0 * loose
-    fx, fy, fz = search[FOOT], search[FOOT + 1], search[FOOT + 2]
     depth, waiting = 1, 0
     nodes[0], keys[0] = (ints[levels] - 1) << 40, 0.0
     mask = np.int64(0)
@@ -237,12 +194,6 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
             low = np.float64(bounds[c])
             if WIDE * i + c >= size or low > limit * limit:
                 continue
-            if free > 0.0 and _lies_in(blocks, start + i, c, fx, fy, fz, free):
-                # Of the disc's facets the first and the last are of one owner, so are all: they are free.
-                k = codes + ((WIDE * i + c) << 4 * level)
-                last = min(k + (1 << 4 * level), codes + ints[FACET_COUNT]) - 1
-                if ints[k] >> 24 == own and ints[last] >> 24 == own:
-                    continue
             if level > 0:
                 # Inserted so that the nearest is next.
                 k = depth
