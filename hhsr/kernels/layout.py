@@ -46,7 +46,7 @@ FRAME, ROTATED = 8, 9  # float slots: centre 3, rotation 9 (leaf to tree)
 # is parted into 2^k × 2^k cells, and has surface in the leaf's region or not; float32 slots of the cells and of the
 # pyramid of ranges.
 CELLS, PARTING, CELL_TABLE, RANGE_TABLE = 10, 11, 12, 13
-BEND_TABLE, BEND_SIZE = 15, 4  # float32 slot of the bend of each base cell, lowest and highest, and its kink and third
+BEND_TABLE, BEND_SIZE = 15, 2  # float32 slot of the bend of each base cell, lowest and highest
 BOX = 14  # float slots: box of the leaf in its own frame 6, least and greatest |p|∞ of its surface
 LEAF_INT_SIZE = 16
 BLOCK_ROWS = 5

@@ -35,6 +35,7 @@ from hhsr.kernels.layout import (
 from hhsr.kernels.unmanaged import unmanaged
 
 UP = 1.0 + 3e-7  # more than one float32 rounding
+MOST_CELLS = 500  # that one square of directions may meet
 STEEP = 1e3  # mm: thickness given to a cell that faces its centre too obliquely to have a tangent plane
 
 
@@ -108,11 +109,11 @@ def bend_over(tab, ints, leaf, face, i0, i1, j0, j1):
 @unmanaged
 def rests_over(tab, ints, leaf, face, a0, a1, b0, b1):
     """Return (kink, third): ∂²W at two points of a rectangle of a face differs by no more than kink + third times their
-    distance.
+    distance; infinite where it meets too many cells.
     """
     n = ints[leaf + CELLS]
     kink = third = 0.0
-    finest = 1
+    finest, count = 1, 0
     for i in range(index_of(a0, n), index_of(a1, n) + 1):
         for j in range(index_of(b0, n), index_of(b1, n) + 1):
             word = ints[ints[leaf + PARTING] + (face * n + i) * n + j]
@@ -120,6 +121,9 @@ def rests_over(tab, ints, leaf, face, a0, a1, b0, b1):
             finest = max(finest, s)
             p0, p1 = max(index_of(a0, n * s) - i * s, 0), min(index_of(a1, n * s) - i * s, s - 1)
             q0, q1 = max(index_of(b0, n * s) - j * s, 0), min(index_of(b1, n * s) - j * s, s - 1)
+            count += (p1 - p0 + 1) * (q1 - q0 + 1)
+            if count > MOST_CELLS:
+                return np.inf, np.inf
             for p in range(p0, p1 + 1):
                 o = ints[leaf + CELL_TABLE] + CELL_SIZE * ((word >> 4) + p * s)
                 for c in range(o + CELL_SIZE * q0, o + CELL_SIZE * q1 + 1, CELL_SIZE):
@@ -266,7 +270,6 @@ def prove_base(blob, leaf, n, planes, count, models, spans, thickness, bends):
                     blob, ints, leaf, face, a, b, half, half
                 )
                 _put_bend(bends, face, i, j, b0, b1)
-                bends[face, i, j, 2], bends[face, i, j, 3] = kink * UP, third * UP
                 _write(models[face, i, j], value, ga, gb, error, half, da, db, kink, third, aa, ab, bb)
                 spans[face, i, j, 0], spans[face, i, j, 1] = lo, hi
                 x, y, z, radius = cell_sphere(face, a, b, half, half, value, ga, gb, error, lo, hi)

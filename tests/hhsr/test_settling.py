@@ -12,14 +12,15 @@ from hhsr.batches import neighbours_first
 from hhsr.compiled import compile_tree
 from hhsr.kernels import layout as at
 from hhsr.kernels.cell import direction_of, inverse_radius
+from hhsr.kernels.clipped_quadratic import clipped_is_clear, least_over_polygon
 from hhsr.kernels.discs import DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment, lowest_bit
 from hhsr.kernels.facets import _along_curve, facet_cell
 from hhsr.kernels.foot import jump_over, leaf_is_free
 from hhsr.kernels.jet import inverse_radius_bend
 from hhsr.kernels.layout import integers, tables
-from hhsr.kernels.maps import rests_over
+from hhsr.kernels.maps import jet_near, jet_of, rests_over
 from hhsr.kernels.patch import LENGTH2, SEARCH_SIZE, START, VECTOR
-from hhsr.kernels.polygon import ROOM
+from hhsr.kernels.polygon import ROOM, clip_polygon
 from hhsr.kernels.quadratic import least_over_square, square_is_clear
 from hhsr.kernels.tree import turn_out_of_leaf
 from hhsr.model import CentreGrid, FloatArray, ModelLeaf, ScaleField, Superquadric, Tree, frozen
@@ -135,6 +136,70 @@ def test_a_square_is_called_clear_only_where_it_is(one: ModelLeaf) -> None:
 
 
 @pytest.mark.parametrize("one", LEAVES)
+def test_the_table_holds_the_jet_of_a_surface_as_near_as_said(one: ModelLeaf) -> None:
+    """To 2e-7·W, what float32 leaves: along a ray that is 1e-6 of the distance and less."""
+    seen = 0
+    for blob, record, (slot, face, a, b, half) in facets(one, 80, np.random.default_rng(8)):
+        ints, tab = integers(blob), tables(blob)
+        exact = np.array(inverse_radius_bend(blob, ints, record, face, a, b))
+        table = np.array(jet_of(tab, slot, half))
+        if np.isnan(table[0]):
+            continue
+        assert abs(table[0] - exact[0]) <= 2e-7 * exact[0]
+        assert np.abs(table[1:3] - exact[1:3]).max() * 2 * half <= 2e-7 * exact[0]
+        assert np.abs(table[3:] - exact[3:]).max() <= 1e-7 * np.abs(exact[3:]).sum() + 1e-9 * exact[0]
+        da, db = 0.3 * half, -0.8 * half
+        near = np.array(jet_near(tab, ints, record, face, a + da, b + db))
+        exact = np.array(inverse_radius_bend(blob, ints, record, face, a + da, b + db))
+        rest = float(tab[slot + at.KINK]) + half * float(tab[slot + at.THIRD])
+        assert abs(near[0] - exact[0]) <= 0.5 * rest * half**2 + 2e-7 * exact[0]
+        seen += 1
+    assert seen > 60
+
+
+@pytest.mark.parametrize("one", LEAVES)
+def test_a_clipped_square_is_called_clear_only_where_it_is(one: ModelLeaf) -> None:
+    """By cuts through the square, its corners and its neighbourhood, one to three at a time."""
+    rng = np.random.default_rng(9)
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 31)] * 2), -1).reshape(-1, 2)
+    called = refused = more = 0
+    for blob, record, (slot, face, a, b, half) in facets(one, 60, rng):
+        tab = tables(blob)
+        kink, third = float(tab[slot + at.KINK]), float(tab[slot + at.THIRD])
+        jet = jet_of(tab, slot, half)
+        if not np.isfinite(third) or np.isnan(jet[0]):
+            continue
+        points = surface(blob, record, face, a + half * grid[:, 0], b + half * grid[:, 1])
+        middle = points[len(points) // 2]
+        planes = []
+        for _ in range(rng.integers(1, 4)):
+            normal = rng.normal(size=3)
+            normal /= np.linalg.norm(normal)
+            planes.append([*normal, normal @ (points[rng.integers(len(points))] + rng.normal(size=3) * 0.1)])
+        held = points[(points @ np.array(planes)[:, :3].T <= np.array(planes)[:, 3]).all(axis=1)]
+        search = np.zeros(SEARCH_SIZE)
+        away = rng.normal(size=3)
+        search[START : START + 3] = middle + away * rng.choice([0.05, 1.0, 20.0]) / np.linalg.norm(away)
+        nearest = np.linalg.norm(held - search[START : START + 3], axis=1).min() if len(held) else np.inf
+        whole = np.linalg.norm(points - search[START : START + 3], axis=1).min()
+        corners, spare = np.empty((ROOM, 3)), np.empty((ROOM, 3))
+        for radius in (0.5 * whole, whole, 0.5 * (whole + min(nearest, 2 * whole)), nearest * 1.0001, nearest * 1.1):
+            if not np.isfinite(radius):
+                continue
+            clear, da, db = clipped_is_clear(
+                np.concatenate(planes), 0, len(planes), search, radius, face, a, b, half, *jet, kink, third, corners,
+                spare,
+            )  # fmt: skip
+            assert max(abs(da), abs(db)) <= half * (1 + 1e-9)
+            assert not (clear and radius > nearest)
+            called, refused = called + clear, refused + (not clear)
+            more += clear and radius > whole * 1.001
+    assert called > 60
+    assert refused > 20
+    assert more > 10  # the cut's own doing
+
+
+@pytest.mark.parametrize("one", LEAVES)
 def test_second_derivatives_change_no_more_over_many_cells(one: ModelLeaf) -> None:
     rng = np.random.default_rng(6)
     seen = 0
@@ -194,6 +259,26 @@ def test_the_least_of_a_quadratic_over_a_square() -> None:
             c + ca * a + cb * b + aa * a * a + 2 * ab * a * b + bb * b * b, abs=1e-9 * (1 + half) ** 2
         )
         assert least >= sampled - 0.02 * half * (abs(ca) + abs(cb) + 4 * half * (abs(aa) + abs(ab) + abs(bb)))
+
+
+def test_the_least_of_a_quadratic_over_a_polygon() -> None:
+    rng = np.random.default_rng(6)
+    x, y = np.meshgrid(*[np.linspace(-1, 1, 301)] * 2)
+    for _ in range(200):
+        c, ca, cb, aa, ab, bb = rng.normal(size=6)
+        corners, spare = np.zeros((ROOM, 3)), np.empty((ROOM, 3))
+        corners[:4, :2] = [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+        size, held = 4, np.full(x.shape, True)
+        for nx, ny, place in rng.normal(size=(rng.integers(0, 4), 3)):
+            size = clip_polygon(corners, size, spare, nx, ny, 0.0, place)
+            held &= nx * x + ny * y <= place
+        if size == 0 or not held.any():
+            continue
+        sampled = (c + ca * x + cb * y + aa * x * x + 2 * ab * x * y + bb * y * y)[held].min()
+        least, a, b = least_over_polygon(c, ca, cb, aa, ab, bb, corners, size)
+        assert least <= sampled + 1e-12
+        assert least == pytest.approx(c + ca * a + cb * b + aa * a * a + 2 * ab * a * b + bb * b * b, abs=1e-9)
+        assert least >= sampled - 0.05 * (abs(ca) + abs(cb) + 2 * (abs(aa) + abs(ab) + abs(bb)))
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
