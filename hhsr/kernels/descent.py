@@ -112,3 +112,14 @@ def descend(blob, ints, tab, owner, face, a, b, search):
         elif max(abs(a), abs(b)) > 1.0:
             face, a, b, _ = face_of(x, y, z)
     return False
+
+
+@unmanaged
+def descend_from(blob, ints, tab, x, y, z, search):
+    """Do as `descend` from a surface point of the tree's frame."""
+    owner = owner_of(blob, ints, 0, x, y, z)
+    o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
+    if ints[o + OWNER_KIND] == MODEL:
+        x, y, z = into_leaf(blob, ints, ints[o + OWNER_RECORD], x, y, z)
+        face, a, b, _ = face_of(x, y, z)
+        descend(blob, ints, tab, owner, face, a, b, search)

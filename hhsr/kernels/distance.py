@@ -12,6 +12,7 @@ from numba import njit
 
 from hhsr.kernels.by_charts import nearest_by_charts
 from hhsr.kernels.crossing import follow_segment, scratch
+from hhsr.kernels.descent import descend_from
 from hhsr.kernels.discs import WIDE
 from hhsr.kernels.foot import FREE, UNPROVEN
 from hhsr.kernels.layout import (
@@ -51,6 +52,7 @@ from hhsr.kernels.patch import (
     offer,
 )
 from hhsr.kernels.polygon import ROOM, segment_to_segment
+from hhsr.kernels.seam import slide_from
 from hhsr.kernels.tree import (
     into_tree,
     out_of_tree,
@@ -313,7 +315,12 @@ def deepest(
         if not search[BEST] < value - near:
             _offer_known(search, ax, ay, az)
             _offer_known(search, bx, by, bz)
-            seeds_beside(blob, ints, tab, value - near, search)
+            descend_from(blob, ints, tab, ax, ay, az, search)
+            descend_from(blob, ints, tab, bx, by, bz, search)
+            slide_from(blob, ints, tab, ax, ay, az, search, local)
+            slide_from(blob, ints, tab, bx, by, bz, search, local)
+            if not search[BEST] < value - near:
+                seeds_beside(blob, ints, tab, value - near, search)
         if not search[BEST] < value - near:
             # Nothing nearer is known: what is the true distance there?
             room = 0.9 * tolerance - max(value - search[BEST], 0.0)

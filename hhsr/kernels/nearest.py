@@ -40,12 +40,13 @@ from hhsr.kernels.patch import (
     VECTOR,
     cell_bound,
     distance_to,
+    into_own_frame,
     offer,
     set_spot,
 )
 from hhsr.kernels.seeds import seed_at, seed_beside
 from hhsr.kernels.settle import settle_cell
-from hhsr.kernels.tree import into_leaf, turn_into_leaf, turn_out_of_leaf
+from hhsr.kernels.tree import turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
 
 VAST = 1e9  # mm
@@ -55,26 +56,13 @@ SAMPLES = 4  # points of a segment that ask for a seed
 
 
 @unmanaged
-def _into_own_frame(blob, ints, leaf, search, local):
-    """Write the search's segment into `local`, in a leaf's frame."""
-    local[START], local[START + 1], local[START + 2] = into_leaf(
-        blob, ints, leaf, search[START], search[START + 1], search[START + 2]
-    )
-    local[LENGTH2] = search[LENGTH2]
-    if search[LENGTH2] > 0.0:
-        local[VECTOR], local[VECTOR + 1], local[VECTOR + 2] = turn_into_leaf(
-            blob, ints[leaf + FRAME], search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
-        )
-
-
-@unmanaged
 def _settle(blob, ints, tab, code, search, local, corners, spare, rects):
     """Offer the nearest point of a facet, or prove that it holds none: by quadratics where no cut touches it."""
     owner = ints[OWNER_INTS] + OWNER_INT_SIZE * (code >> 24)
     leaf, planes = ints[owner + OWNER_RECORD], ints[owner + OWNER_PLANE_FLOATS]
     count = 0 if code & 1 else ints[owner + OWNER_PLANES]
     frame = ints[leaf + FRAME]
-    _into_own_frame(blob, ints, leaf, search, local)
+    into_own_frame(blob, ints, leaf, search, local)
     local[BEST] = search[BEST]
     o, face, a, b, half = facet_cell(ints, leaf, code)
     if not settle_cell(blob, ints, tab, leaf, planes, count, local, face, o, a, b, half, corners, spare, rects):

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from hhsr.kernels.cell import chart_of, direction_of, inverse_radius
-from hhsr.kernels.layout import BOX
+from hhsr.kernels.layout import BOX, FRAME
 from hhsr.kernels.maps import (
     cell_corners,
     cell_sphere,
@@ -20,6 +20,7 @@ from hhsr.kernels.maps import (
     ray_thickness,
 )
 from hhsr.kernels.polygon import clip_polygon, polygon_to_segment
+from hhsr.kernels.tree import into_leaf, turn_into_leaf
 from hhsr.kernels.unmanaged import unmanaged
 
 # Slots of a search: start 3, vector 3, squared length; best distance, t, point 3 (owner's frame); tolerance; and where
@@ -43,6 +44,19 @@ def distance_to(search, x, y, z):
         t = min(max((rx * dx + ry * dy + rz * dz) / search[LENGTH2], 0.0), 1.0)
         rx, ry, rz = rx - t * dx, ry - t * dy, rz - t * dz
     return math.sqrt(rx * rx + ry * ry + rz * rz), t
+
+
+@unmanaged
+def into_own_frame(blob, ints, leaf, search, local):
+    """Write the search's segment into `local`, in a leaf's frame."""
+    local[START], local[START + 1], local[START + 2] = into_leaf(
+        blob, ints, leaf, search[START], search[START + 1], search[START + 2]
+    )
+    local[LENGTH2] = search[LENGTH2]
+    if search[LENGTH2] > 0.0:
+        local[VECTOR], local[VECTOR + 1], local[VECTOR + 2] = turn_into_leaf(
+            blob, ints[leaf + FRAME], search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
+        )
 
 
 @unmanaged

@@ -22,7 +22,7 @@ MOVES = 5
 
 
 @unmanaged
-def _improves(blob, ints, leaf, planes, count, search, face, a, b, wa, wb):
+def improves(blob, ints, leaf, planes, count, search, face, a, b, wa, wb):
     """Offer the surface point over (a, b), moved into the region where W has the slopes (wa, wb); return whether it is
     the best one now.
     """
@@ -87,7 +87,7 @@ def settle_cell(blob, ints, tab, leaf, planes, count, search, face, o, a, b, hal
         )  # fmt: skip
         if clear:
             return True
-        if turn == 1 or not _improves(blob, ints, leaf, planes, count, search, face, a + da, b + db, sa, sb):
+        if turn == 1 or not improves(blob, ints, leaf, planes, count, search, face, a + da, b + db, sa, sb):
             break
     # From here on the bounds are asked between any two points of the cell, not from its middle: twice as much.
     kink, third = 2.0 * kink, 2.0 * third
@@ -107,7 +107,7 @@ def settle_cell(blob, ints, tab, leaf, planes, count, search, face, o, a, b, hal
             if (
                 clear
                 or turn == 1
-                or not _improves(blob, ints, leaf, planes, count, search, face, a + da, b + db, wa, wb)
+                or not improves(blob, ints, leaf, planes, count, search, face, a + da, b + db, wa, wb)
             ):
                 break
         if clear:
