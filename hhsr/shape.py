@@ -33,8 +33,9 @@ from hhsr.compiled import Compiled, compile_tree
 from hhsr.errors import FileFormatError, InputError
 from hhsr.kernels import contains as contains_kernels
 from hhsr.kernels import crossing as crossing_kernels
-from hhsr.kernels import distance as distance_kernels
 from hhsr.kernels import tree as tree_kernels
+from hhsr.kernels.clearance import clearance_many
+from hhsr.kernels.distance import distance_one
 from hhsr.local_error import errors_at
 from hhsr.model import ErrorFigures, FloatArray, Provenance, Tree, rotation_matrix
 from hhsr.surface import reconstruct
@@ -191,7 +192,7 @@ class Shape:
         if is_point(points) and on_invalid == "raise":
             tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-6, 1e3)
             x, y, z = points.tolist()
-            distance: float = distance_kernels.distance_one(self._blob, x, y, z, tolerance)
+            distance: float = distance_one(self._blob, x, y, z, tolerance)
             if distance == distance:  # else it is NaN: the row is named below
                 return distance
         return self._nearest(points, on_invalid, tolerance_mm)[1]
@@ -320,10 +321,7 @@ class Shape:
             thick = as_float(radius, "radius", 0.0)
             tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-4, 1e3)
             value = np.empty(1)
-            if (
-                distance_kernels.clearance_many(self._blob, start, end, tolerance, value, np.empty(1), np.empty((1, 3)))
-                == 0
-            ):
+            if clearance_many(self._blob, start, end, tolerance, value, np.empty(1), np.empty((1, 3))) == 0:
                 return value.item() - thick
         return self.closest_approach(starts, ends, radius, on_invalid, tolerance_mm).clearance
 
@@ -346,9 +344,7 @@ class Shape:
             in_parts(
                 len(first),
                 500,
-                lambda i, j: distance_kernels.clearance_many(
-                    blob, first[i:j], last[i:j], tolerance, value[i:j], t[i:j], foot[i:j]
-                ),
+                lambda i, j: clearance_many(blob, first[i:j], last[i:j], tolerance, value[i:j], t[i:j], foot[i:j]),
             )
         )
         if bad and not mark:

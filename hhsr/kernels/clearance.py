@@ -1,0 +1,211 @@
+"""Clearance of segments: their distance to the solid, or how deep they run in it (DESIGN §2, §4).
+
+Any surface point bounds the depth at every place by its distance: a depth is proven from above by points found, and
+from below by one true distance or two.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from hhsr.kernels.crossing import follow_segment, scratch
+from hhsr.kernels.descent import descend_from
+from hhsr.kernels.distance import near_scratch, search_surface, set_search
+from hhsr.kernels.layout import integers, tables
+from hhsr.kernels.nearest import seed_point, seeds_beside
+from hhsr.kernels.patch import BEST, BEST_T, FAR, FOOT, TOLERANCE, distance_to, offer
+from hhsr.kernels.seam import slide_from
+from hhsr.kernels.tree import into_tree, out_of_tree
+from hhsr.kernels.unmanaged import unmanaged
+
+ROUGHLY = 6.0  # tolerances: as nearly as a foot is sought that is to lower a bound of the depth
+SPANS = 256  # parts of one segment's stretch inside
+
+
+@unmanaged
+def _offer_known(search, x, y, z):
+    """Offer a surface point to a search about a point."""
+    distance, t = distance_to(search, x, y, z)
+    offer(search, distance, t, x, y, z)
+
+
+@unmanaged
+def _highest(px, py, pz, dx, dy, dz, t0, t1, ax, ay, az, bx, by, bz):
+    """Return the greatest min(|p(t) − a|, |p(t) − b|)² on [t0, t1], and its t: an upper bound of the distance²."""
+    dd = dx * dx + dy * dy + dz * dz
+    c0 = (px - ax) ** 2 + (py - ay) ** 2 + (pz - az) ** 2
+    c1 = 2.0 * (dx * (px - ax) + dy * (py - ay) + dz * (pz - az))
+    e0 = (px - bx) ** 2 + (py - by) ** 2 + (pz - bz) ** 2
+    e1 = 2.0 * (dx * (px - bx) + dy * (py - by) + dz * (pz - bz))
+    best, where = -1.0, t0
+    for k in range(3):
+        if k == 0:
+            t = t0
+        elif k == 1:
+            t = t1
+        else:
+            if c1 == e1:
+                continue
+            t = (e0 - c0) / (c1 - e1)
+            if not t0 < t < t1:
+                continue
+        value = min(c0 + t * (c1 + t * dd), e0 + t * (e1 + t * dd))
+        if value > best:
+            best, where = value, t
+    return best, where
+
+
+@unmanaged
+def _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, b, bx, by, bz):
+    """Write a span: its ends' t and surface points, the highest bound between them, and its t."""
+    spans[s, 0], spans[s, 1], spans[s, 2], spans[s, 3] = a, ax, ay, az
+    spans[s, 4], spans[s, 5], spans[s, 6], spans[s, 7] = b, bx, by, bz
+    value2, spans[s, 9] = _highest(px, py, pz, dx, dy, dz, a, b, ax, ay, az, bx, by, bz)
+    spans[s, 8] = math.sqrt(value2)
+
+
+@unmanaged
+def _tell_spans(spans, used, px, py, pz, dx, dy, dz, x, y, z):
+    """Let a surface point stand for the ends of all spans that it is nearer to than their own."""
+    for s in range(used):
+        nearer = False
+        for o in range(0, 8, 4):
+            t = spans[s, o]
+            qx, qy, qz = px + t * dx, py + t * dy, pz + t * dz
+            own2 = (spans[s, o + 1] - qx) ** 2 + (spans[s, o + 2] - qy) ** 2 + (spans[s, o + 3] - qz) ** 2
+            if (x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2 < own2:
+                spans[s, o + 1], spans[s, o + 2], spans[s, o + 3] = x, y, z
+                nearer = True
+        if nearer:
+            _put_span(
+                spans, s, px, py, pz, dx, dy, dz, spans[s, 0], spans[s, 1], spans[s, 2], spans[s, 3], spans[s, 4],
+                spans[s, 5], spans[s, 6], spans[s, 7],
+            )  # fmt: skip
+
+
+@unmanaged
+def deepest(
+    blob, ints, tab, px, py, pz, dx, dy, dz, t0, t1, on0, on1, tolerance, floor, out,
+    search, local, nodes, keys, corners, spare, rects, spans,
+):  # fmt: skip
+    """Return an upper bound of the depth on [t0, t1] where p + t·d is inside, at most `tolerance` above the truth.
+
+    Or above `floor`, a depth already known: no more than that need be proven below it. Any surface point bounds the
+    depth at every t by its distance. So intervals between two t are bounded by the surface points found at both, and
+    parted where that bound is highest, by points found on the way down that nothing proves; only where these lower it
+    no more is the true distance asked, as nearly as the bound leaves room for. on0, on1: the ends lie on the surface.
+    out: best t and foot (4,).
+    """
+    near = 0.25 * tolerance
+    sure = 0.0  # a depth that is reached
+    for k in range(2):
+        t = t0 if k == 0 else t1
+        x, y, z = px + t * dx, py + t * dy, pz + t * dz
+        if not (on0 if k == 0 else on1):
+            # Some surface point will do: if the bound is highest here, the true distance is asked below.
+            set_search(search, x, y, z, 0.0, 0.0, 0.0, ROUGHLY * tolerance)
+            seed_point(blob, ints, tab, search)
+            if search[BEST] == FAR:
+                search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+            x, y, z = search[FOOT], search[FOOT + 1], search[FOOT + 2]
+        o = 4 * k
+        spans[0, o], spans[0, o + 1], spans[0, o + 2], spans[0, o + 3] = t, x, y, z
+    _put_span(
+        spans, 0, px, py, pz, dx, dy, dz, t0, spans[0, 1], spans[0, 2], spans[0, 3], t1, spans[0, 5], spans[0, 6],
+        spans[0, 7],
+    )  # fmt: skip
+    used = 1
+    for turn in range(2 * SPANS):
+        s = 0
+        for k in range(1, used):
+            if spans[k, 8] > spans[s, 8]:
+                s = k
+        value, t = spans[s, 8], spans[s, 9]
+        if value <= max(sure + tolerance, floor) or used == spans.shape[0] or turn == 2 * SPANS - 1:
+            break
+        a, ax, ay, az = spans[s, 0], spans[s, 1], spans[s, 2], spans[s, 3]
+        b, bx, by, bz = spans[s, 4], spans[s, 5], spans[s, 6], spans[s, 7]
+        set_search(search, px + t * dx, py + t * dy, pz + t * dz, 0.0, 0.0, 0.0, ROUGHLY * tolerance)
+        if a < t < b:
+            seed_point(blob, ints, tab, search)
+        if not search[BEST] < value - near:
+            _offer_known(search, ax, ay, az)
+            _offer_known(search, bx, by, bz)
+            descend_from(blob, ints, tab, ax, ay, az, search)
+            descend_from(blob, ints, tab, bx, by, bz, search)
+            slide_from(blob, ints, tab, ax, ay, az, search, local)
+            slide_from(blob, ints, tab, bx, by, bz, search, local)
+            if not search[BEST] < value - near:
+                seeds_beside(blob, ints, tab, value - near, search)
+        if not search[BEST] < value - near:
+            # Nothing nearer is known: what is the true distance there?
+            room = 0.9 * tolerance - max(value - search[BEST], 0.0)
+            search[TOLERANCE] = room
+            search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+            if search[BEST] - room > sure:
+                sure = search[BEST] - room
+                if search[BEST] > floor:
+                    out[0], out[1], out[2], out[3] = t, search[FOOT], search[FOOT + 1], search[FOOT + 2]
+        x, y, z = search[FOOT], search[FOOT + 1], search[FOOT + 2]
+        if a < t < b:
+            _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, t, x, y, z)
+            _put_span(spans, used, px, py, pz, dx, dy, dz, t, x, y, z, b, bx, by, bz)
+            used += 1
+        elif t <= a:
+            _put_span(spans, s, px, py, pz, dx, dy, dz, a, x, y, z, b, bx, by, bz)
+        else:
+            _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, b, x, y, z)
+        _tell_spans(spans, used, px, py, pz, dx, dy, dz, x, y, z)
+    return max(floor, value)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def clearance_many(blob, starts, ends, tolerance, value, t, foot):
+    """Fill (n,) clearance of the axes of LPS segments (no radius), (n,) where along it, (n, 3) the surface point there.
+
+    truth − tolerance ≤ value ≤ truth; NaN where not finite. Returns how many are not finite.
+    """
+    ints, tab = integers(blob), tables(blob)
+    search, local, nodes, keys, corners, spare, rects = near_scratch()
+    work, slots, pending = scratch()
+    ts, out, spans = np.empty(512), np.empty(4), np.empty((SPANS, 10))
+    bad = 0
+    for i in range(starts.shape[0]):
+        ok = True
+        for k in range(3):
+            ok = ok and math.isfinite(starts[i, k]) and math.isfinite(ends[i, k])
+        if not ok:
+            value[i], t[i] = np.nan, np.nan
+            foot[i, 0], foot[i, 1], foot[i, 2] = np.nan, np.nan, np.nan
+            bad += 1
+            continue
+        px, py, pz = into_tree(blob, ints, starts[i, 0], starts[i, 1], starts[i, 2])
+        ex, ey, ez = into_tree(blob, ints, ends[i, 0], ends[i, 1], ends[i, 2])
+        dx, dy, dz = ex - px, ey - py, ez - pz
+        inside, count = follow_segment(
+            blob, ints, tab, np.int64(0), px, py, pz, ex, ey, ez, 0.1 * tolerance, 0.1 * tolerance, np.bool_(False),
+            ts, work, slots, pending,
+        )  # fmt: skip
+        if not inside and count == 0:
+            set_search(search, px, py, pz, dx, dy, dz, tolerance)
+            search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+            value[i], t[i] = search[BEST] - search[TOLERANCE], search[BEST_T]
+            foot[i, 0], foot[i, 1], foot[i, 2] = out_of_tree(
+                blob, ints, search[FOOT], search[FOOT + 1], search[FOOT + 2]
+            )
+            continue
+        deep, begin = 0.0, 0.0
+        out[0], out[1], out[2], out[3] = 0.0, np.nan, np.nan, np.nan
+        for k in range(min(count, ts.shape[0]) + 1):
+            end = ts[k] if k < count else 1.0
+            if inside and end >= begin:
+                deep = max(
+                    deep,
+                    deepest(blob, ints, tab, px, py, pz, dx, dy, dz, begin, end, k > 0, k < count, 0.8 * tolerance,
+                            deep, out, search, local, nodes, keys, corners, spare, rects, spans),
+                )  # fmt: skip
+            inside, begin = not inside, end
+        value[i], t[i] = -deep - 0.1 * tolerance, out[0]
+        foot[i, 0], foot[i, 1], foot[i, 2] = out_of_tree(blob, ints, out[1], out[2], out[3])
+    return bad
