@@ -63,18 +63,6 @@ def nearest_to_rows(blob: FloatArray, points: FloatArray, tolerance: float) -> t
     return distance, foot, int(sum(bad))
 
 
-def one_row(points: ArrayLike) -> FloatArray | None:
-    """Return a fresh (1, 3) of a single point given as a float64 array (3,), else None: the way of single calls.
-
-    A copy has one layout and may be written, whatever came in, so that the kernels are never compiled anew for it.
-    """
-    if type(points) is np.ndarray and points.shape == (3,) and points.dtype == np.float64:
-        row = np.empty((1, 3))
-        row[0] = points
-        return row
-    return None
-
-
 def is_point(value: object) -> TypeGuard[FloatArray]:
     """Return whether a value is a float64 array (3,): what single calls take without a copy."""
     return type(value) is np.ndarray and value.shape == (3,) and value.dtype == np.float64

@@ -24,7 +24,6 @@ from hhsr.answers import (
     is_point,
     marks,
     nearest_to_rows,
-    one_row,
     scalar,
 )
 from hhsr.batches import in_parts
@@ -34,7 +33,7 @@ from hhsr.errors import FileFormatError, InputError
 from hhsr.kernels import contains as contains_kernels
 from hhsr.kernels import crossing as crossing_kernels
 from hhsr.kernels import tree as tree_kernels
-from hhsr.kernels.clearance import clearance_many
+from hhsr.kernels.clearance import clearance_many, clearance_one
 from hhsr.kernels.distance import distance_one
 from hhsr.local_error import errors_at
 from hhsr.model import ErrorFigures, FloatArray, Provenance, Tree, rotation_matrix
@@ -317,12 +316,13 @@ class Shape:
         min over the segment of signed_distance − radius: −(greatest depth) − radius where the axis enters. Never above
         the truth, at most the tolerance below it. NaN where not finite, with on_invalid="mark".
         """
-        if (start := one_row(starts)) is not None and (end := one_row(ends)) is not None and on_invalid == "raise":
+        if is_point(starts) and is_point(ends) and on_invalid == "raise":
             thick = as_float(radius, "radius", 0.0)
             tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-4, 1e3)
-            value = np.empty(1)
-            if clearance_many(self._blob, start, end, tolerance, value, np.empty(1), np.empty((1, 3))) == 0:
-                return value.item() - thick
+            (ax, ay, az), (bx, by, bz) = starts.tolist(), ends.tolist()
+            value: float = clearance_one(self._blob, ax, ay, az, bx, by, bz, tolerance)
+            if value == value:  # else it is NaN: the row is named below
+                return value - thick
         return self.closest_approach(starts, ends, radius, on_invalid, tolerance_mm).clearance
 
     def closest_approach(

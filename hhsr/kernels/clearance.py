@@ -17,7 +17,7 @@ from hhsr.kernels.nearest import seed_point, seeds_beside
 from hhsr.kernels.patch import BEST, BEST_T, FAR, FOOT, TOLERANCE, distance_to, offer
 from hhsr.kernels.seam import slide_from
 from hhsr.kernels.tree import into_tree, out_of_tree
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import managed, unmanaged
 
 ROUGHLY = 6.0  # tolerances: as nearly as a foot is sought that is to lower a bound of the depth
 SPANS = 256  # parts of one segment's stretch inside
@@ -160,6 +160,59 @@ def deepest(
     return max(floor, value)
 
 
+@unmanaged
+def _clearance(
+    blob, ints, tab, px, py, pz, ex, ey, ez, tolerance, ts, out, search, local, nodes, keys, corners, spare, rects,
+    spans, work, slots, pending,
+):  # fmt: skip
+    """Return the clearance of a segment of the tree's frame. out: (4,) where along it, and the surface point."""
+    dx, dy, dz = ex - px, ey - py, ez - pz
+    inside, count = follow_segment(
+        blob, ints, tab, np.int64(0), px, py, pz, ex, ey, ez, 0.1 * tolerance, 0.1 * tolerance, np.bool_(False), ts,
+        work, slots, pending,
+    )  # fmt: skip
+    if not inside and count == 0:
+        set_search(search, px, py, pz, dx, dy, dz, tolerance)
+        search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+        out[0], out[1], out[2], out[3] = search[BEST_T], search[FOOT], search[FOOT + 1], search[FOOT + 2]
+        return search[BEST] - search[TOLERANCE]
+    deep, begin = 0.0, 0.0
+    out[0], out[1], out[2], out[3] = 0.0, np.nan, np.nan, np.nan
+    for k in range(min(count, ts.shape[0]) + 1):
+        end = ts[k] if k < count else 1.0
+        if inside and end >= begin:
+            deep = max(
+                deep,
+                deepest(blob, ints, tab, px, py, pz, dx, dy, dz, begin, end, k > 0, k < count, 0.8 * tolerance, deep,
+                        out, search, local, nodes, keys, corners, spare, rects, spans),
+            )  # fmt: skip
+        inside, begin = not inside, end
+    return -deep - 0.1 * tolerance
+
+
+@managed
+def _clearance_scratch():
+    """Return (ts, out, spans)."""
+    return np.empty(512), np.empty(4), np.empty((SPANS, 10))
+
+
+@njit(cache=True, error_model="numpy")
+def clearance_one(blob, ax, ay, az, bx, by, bz, tolerance):
+    """Return the clearance of the axis of one LPS segment (no radius): NaN where not finite."""
+    if not math.isfinite(ax + ay + az + bx + by + bz):
+        return np.nan
+    ints, tab = integers(blob), tables(blob)
+    search, local, nodes, keys, corners, spare, rects = near_scratch()
+    work, slots, pending = scratch()
+    ts, out, spans = _clearance_scratch()
+    px, py, pz = into_tree(blob, ints, ax, ay, az)
+    ex, ey, ez = into_tree(blob, ints, bx, by, bz)
+    return _clearance(
+        blob, ints, tab, px, py, pz, ex, ey, ez, tolerance, ts, out, search, local, nodes, keys, corners, spare, rects,
+        spans, work, slots, pending,
+    )  # fmt: skip
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def clearance_many(blob, starts, ends, tolerance, value, t, foot):
     """Fill (n,) clearance of the axes of LPS segments (no radius), (n,) where along it, (n, 3) the surface point there.
@@ -169,7 +222,7 @@ def clearance_many(blob, starts, ends, tolerance, value, t, foot):
     ints, tab = integers(blob), tables(blob)
     search, local, nodes, keys, corners, spare, rects = near_scratch()
     work, slots, pending = scratch()
-    ts, out, spans = np.empty(512), np.empty(4), np.empty((SPANS, 10))
+    ts, out, spans = _clearance_scratch()
     bad = 0
     for i in range(starts.shape[0]):
         ok = True
@@ -182,30 +235,10 @@ def clearance_many(blob, starts, ends, tolerance, value, t, foot):
             continue
         px, py, pz = into_tree(blob, ints, starts[i, 0], starts[i, 1], starts[i, 2])
         ex, ey, ez = into_tree(blob, ints, ends[i, 0], ends[i, 1], ends[i, 2])
-        dx, dy, dz = ex - px, ey - py, ez - pz
-        inside, count = follow_segment(
-            blob, ints, tab, np.int64(0), px, py, pz, ex, ey, ez, 0.1 * tolerance, 0.1 * tolerance, np.bool_(False),
-            ts, work, slots, pending,
+        value[i] = _clearance(
+            blob, ints, tab, px, py, pz, ex, ey, ez, tolerance, ts, out, search, local, nodes, keys, corners, spare,
+            rects, spans, work, slots, pending,
         )  # fmt: skip
-        if not inside and count == 0:
-            set_search(search, px, py, pz, dx, dy, dz, tolerance)
-            search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
-            value[i], t[i] = search[BEST] - search[TOLERANCE], search[BEST_T]
-            foot[i, 0], foot[i, 1], foot[i, 2] = out_of_tree(
-                blob, ints, search[FOOT], search[FOOT + 1], search[FOOT + 2]
-            )
-            continue
-        deep, begin = 0.0, 0.0
-        out[0], out[1], out[2], out[3] = 0.0, np.nan, np.nan, np.nan
-        for k in range(min(count, ts.shape[0]) + 1):
-            end = ts[k] if k < count else 1.0
-            if inside and end >= begin:
-                deep = max(
-                    deep,
-                    deepest(blob, ints, tab, px, py, pz, dx, dy, dz, begin, end, k > 0, k < count, 0.8 * tolerance,
-                            deep, out, search, local, nodes, keys, corners, spare, rects, spans),
-                )  # fmt: skip
-            inside, begin = not inside, end
-        value[i], t[i] = -deep - 0.1 * tolerance, out[0]
+        t[i] = out[0]
         foot[i, 0], foot[i, 1], foot[i, 2] = out_of_tree(blob, ints, out[1], out[2], out[3])
     return bad
