@@ -31,6 +31,22 @@ def _offer_known(search, x, y, z):
 
 
 @unmanaged
+def _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, below, search, local):
+    """Offer two surface points, and go on from them and from the facets beside until one is nearer than `below`."""
+    _offer_known(search, ax, ay, az)
+    _offer_known(search, bx, by, bz)
+    for way in range(4):
+        x, y, z = (ax, ay, az) if way % 2 == 0 else (bx, by, bz)
+        if way < 2:
+            descend_from(blob, ints, tab, x, y, z, search)
+        else:
+            slide_from(blob, ints, tab, x, y, z, search, local)
+        if search[BEST] < below:
+            return
+    seeds_beside(blob, ints, tab, below, search)
+
+
+@unmanaged
 def _highest(px, py, pz, dx, dy, dz, t0, t1, ax, ay, az, bx, by, bz):
     """Return the greatest min(|p(t) − a|, |p(t) − b|)² on [t0, t1], and its t: an upper bound of the distance²."""
     dd = dx * dx + dy * dy + dz * dz
@@ -107,7 +123,7 @@ def deepest(
             set_search(search, x, y, z, 0.0, 0.0, 0.0, ROUGHLY * tolerance)
             seed_point(blob, ints, tab, search)
             if search[BEST] == FAR:
-                search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+                search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, np.bool_(True))
             x, y, z = search[FOOT], search[FOOT + 1], search[FOOT + 2]
         o = 4 * k
         spans[0, o], spans[0, o + 1], spans[0, o + 2], spans[0, o + 3] = t, x, y, z
@@ -130,19 +146,12 @@ def deepest(
         if a < t < b:
             seed_point(blob, ints, tab, search)
         if not search[BEST] < value - near:
-            _offer_known(search, ax, ay, az)
-            _offer_known(search, bx, by, bz)
-            descend_from(blob, ints, tab, ax, ay, az, search)
-            descend_from(blob, ints, tab, bx, by, bz, search)
-            slide_from(blob, ints, tab, ax, ay, az, search, local)
-            slide_from(blob, ints, tab, bx, by, bz, search, local)
-            if not search[BEST] < value - near:
-                seeds_beside(blob, ints, tab, value - near, search)
+            _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, value - near, search, local)
         if not search[BEST] < value - near:
             # Nothing nearer is known: what is the true distance there?
             room = 0.9 * tolerance - max(value - search[BEST], 0.0)
             search[TOLERANCE] = room
-            search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+            search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, np.bool_(True))
             if search[BEST] - room > sure:
                 sure = search[BEST] - room
                 if search[BEST] > floor:
@@ -173,7 +182,7 @@ def _clearance(
     )  # fmt: skip
     if not inside and count == 0:
         set_search(search, px, py, pz, dx, dy, dz, tolerance)
-        search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+        search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, np.bool_(False))
         out[0], out[1], out[2], out[3] = search[BEST_T], search[FOOT], search[FOOT + 1], search[FOOT + 2]
         return search[BEST] - search[TOLERANCE]
     deep, begin = 0.0, 0.0

@@ -44,9 +44,11 @@ def descend(blob, ints, tab, owner, face, a, b, search):
         planes, count = ints[o + OWNER_PLANE_FLOATS], ints[o + OWNER_PLANES]
         frame = ints[leaf + FRAME]
         px, py, pz = into_leaf(blob, ints, leaf, search[START], search[START + 1], search[START + 2])
-        w, wa, wb, waa, wab, wbb = jet_near(tab, ints, leaf, face, a, b)
         rough -= 1
-        if rough < 0 or not w > 0.0:
+        w = 0.0
+        if rough >= 0:
+            w, wa, wb, waa, wab, wbb = jet_near(tab, ints, leaf, face, a, b)
+        if not w > 0.0:
             rough = -1
             w, wa, wb, waa, wab, wbb = inverse_radius_bend(blob, ints, leaf, face, a, b)
             if w == 0.0:

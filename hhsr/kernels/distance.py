@@ -133,15 +133,18 @@ def _nearest_step(blob, ints, tab, search):
 
 
 @unmanaged
-def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects):
-    """Find the surface point nearest to the search's segment, to its tolerance: truth ∈ [best − tolerance, best]."""
+def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, seeded):
+    """Find the surface point nearest to the search's segment, to its tolerance: truth ∈ [best − tolerance, best].
+
+    seeded: of a point, and what `seed_point` gives is known already.
+    """
     if search[LENGTH2] == 0.0:
         outcome = nearest_by_charts(blob, ints, tab, search, local, nodes, spare)
         if outcome == FREE:
             _nearest_step(blob, ints, tab, search)
         if outcome != UNPROVEN:
             return
-    nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+    nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, seeded)
     _nearest_step(blob, ints, tab, search)
     for owner in range(ints[OWNER_COUNT]):
         o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
@@ -158,7 +161,7 @@ def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, 
 def _signed_distance(blob, ints, tab, x, y, z, tolerance, search, local, nodes, keys, corners, spare, rects):
     """Return the signed distance of a point of the tree's frame; the search then holds the surface point."""
     set_search(search, x, y, z, 0.0, 0.0, 0.0, tolerance)
-    search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects)
+    search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, np.bool_(False))
     side = search[SIDE]
     if side == 0.0:
         side = -1.0 if solid_contains(blob, ints, tab, np.int64(0), x, y, z) else 1.0

@@ -133,11 +133,11 @@ def _seed_segment(blob, ints, tab, search, local):
 
 
 @unmanaged
-def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spare, rects):
+def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, seeded):
     """Improve the search (tree's frame) by the surface of all model leaves, each within its region.
 
-    nodes, keys: (LATE + NODE_ROOM + 8,) scratch: pending blocks and their bounds, from LATE on the facets
-    yet to be settled; last the bounds of a block.
+    seeded: of a point, and what a seed gives is known already. nodes, keys: (LATE + NODE_ROOM + 8,) scratch: pending
+    blocks and their bounds, from LATE on the facets yet to be settled; last the bounds of a block.
     """
     if ints[FACET_COUNT] == 0:
         return
@@ -147,7 +147,7 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
     local[TOLERANCE] = search[TOLERANCE]
     if moving:
         _seed_segment(blob, ints, tab, search, local)
-    else:
+    elif not seeded:
         seed_point(blob, ints, tab, search)
     x, y, z = search[START], search[START + 1], search[START + 2]
     dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]

@@ -3,7 +3,7 @@
 Nothing is proven by it: where it ends the surface point is an upper bound.
 """
 
-from hhsr.kernels.cell import chart_of, direction_of, face_of
+from hhsr.kernels.cell import chart_of, direction_of, face_of, inverse_radius, minor_parts
 from hhsr.kernels.jet import has_jets, inverse_radius_jet
 from hhsr.kernels.layout import (
     FRAME,
@@ -47,7 +47,7 @@ def slide_from(blob, ints, tab, x, y, z, search, local):
         return
     into_own_frame(blob, ints, leaf, search, local)
     local[BEST], local[TOLERANCE] = search[BEST], search[TOLERANCE]
-    nx, ny, nz = blob[cut], blob[cut + 1], blob[cut + 2]
+    nx, ny, nz, place = blob[cut], blob[cut + 1], blob[cut + 2], blob[cut + 3]
     face, a, b, _ = face_of(x, y, z)
     last = 0.0
     for _ in range(STEPS):
@@ -66,8 +66,17 @@ def slide_from(blob, ints, tab, x, y, z, search, local):
         left = along / last if last != 0.0 else 0.0
         last = along
         step = along / (1.0 - left) if abs(left) < 0.9 else along
-        a, b, m = chart_of(face, x + step * ux, y + step * uy, z + step * uz)
-        if not (m > 0.0 and max(abs(a), abs(b)) <= 1.0):
+        was = face
+        face, a, b, _ = face_of(x + step * ux, y + step * uy, z + step * uz)
+        if face != was:
+            w, wa, wb = inverse_radius_jet(blob, ints, leaf, face, a, b)
+        # Back on to the cut, for the leaf's surface turns away from it or beyond.
+        na, nb = minor_parts(face, nx, ny, nz)
+        na, nb = na - place * wa, nb - place * wb
+        x, y, z = direction_of(face, a, b)
+        excess = nx * x + ny * y + nz * z - place * inverse_radius(blob, ints, leaf, face, a, b)
+        a, b = a - excess * na / (na * na + nb * nb), b - excess * nb / (na * na + nb * nb)
+        if not max(abs(a), abs(b)) <= 1.0:
             break
         best = local[BEST]
         if not improves(blob, ints, leaf, planes, count, local, face, a, b, wa, wb):
