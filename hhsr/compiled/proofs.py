@@ -15,8 +15,9 @@ from hhsr.kernels import layout as at
 from hhsr.kernels import slab as slab_at
 from hhsr.kernels import voxels as voxel_at
 from hhsr.kernels.crossing import first_exits
+from hhsr.kernels.disc_order import order_facets
 from hhsr.kernels.discs import DISC_SIZE, WIDE, fill_discs, level_sizes
-from hhsr.kernels.facets import list_facets, place_facets
+from hhsr.kernels.facets import list_facets
 from hhsr.kernels.region_box import leaf_box, part_box
 from hhsr.kernels.seeds import fill_seeds
 from hhsr.kernels.slab_bounds import fill_lobe_spheres
@@ -53,9 +54,8 @@ class Proofs(Records):
         code, disc = np.concatenate(codes), np.concatenate(discs)
         if len(code) == 0:
             return blob
-        keys = np.empty(len(code), dtype=np.int64)
-        place_facets(view, code, keys)
-        order = np.argsort(keys, kind="stable")
+        order = np.empty(len(code), dtype=np.int64)
+        order_facets(np.ascontiguousarray(disc[:, :3]), order)
         code, disc = code[order], disc[order]
         sizes = np.array(level_sizes(len(code)), dtype=np.int64)
         per_level = -(-sizes // WIDE)

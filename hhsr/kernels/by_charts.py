@@ -14,7 +14,7 @@ from hhsr.kernels.layout import (
     OWNER_KIND,
     OWNER_RECORD,
 )
-from hhsr.kernels.patch import BEST, FOOT, SIDE, SPOT, START, TOLERANCE, offer, set_spot
+from hhsr.kernels.patch import BEST, FOOT, SIDE, START, TOLERANCE, offer
 from hhsr.kernels.tree import into_leaf, owner_of, turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
 
@@ -75,7 +75,6 @@ def nearest_by_charts(blob, ints, tab, search, local, nodes, spare):
         frame = ints[leaf + FRAME]
         x, y, z = turn_out_of_leaf(blob, frame, local[FOOT], local[FOOT + 1], local[FOOT + 2])
         offer(search, distance, 0.0, x + blob[frame], y + blob[frame + 1], z + blob[frame + 2])
-        set_spot(search, owner, local[SPOT + 1], local[SPOT + 2], local[SPOT + 3])
         search[SIDE] = local[SIDE]
     if outcome == FREE and not _others_are_free(blob, ints, tab, owner, search, local, nodes, spare):
         return UNPROVEN

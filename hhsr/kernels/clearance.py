@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from hhsr.kernels.crossing import follow_segment, scratch
-from hhsr.kernels.descent import descend_from
+from hhsr.kernels.descent import descend_from, onto_surface
 from hhsr.kernels.distance import near_scratch, search_surface, set_search
 from hhsr.kernels.layout import integers, tables
 from hhsr.kernels.nearest import seed_point, seeds_beside
@@ -124,6 +124,7 @@ def deepest(
             seed_point(blob, ints, tab, search)
             if search[BEST] == FAR:
                 search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, np.bool_(True))
+            onto_surface(blob, ints, search)
             x, y, z = search[FOOT], search[FOOT + 1], search[FOOT + 2]
         o = 4 * k
         spans[0, o], spans[0, o + 1], spans[0, o + 2], spans[0, o + 3] = t, x, y, z
@@ -156,6 +157,7 @@ def deepest(
                 sure = search[BEST] - room
                 if search[BEST] > floor:
                     out[0], out[1], out[2], out[3] = t, search[FOOT], search[FOOT + 1], search[FOOT + 2]
+        onto_surface(blob, ints, search)
         x, y, z = search[FOOT], search[FOOT + 1], search[FOOT + 2]
         if a < t < b:
             _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, t, x, y, z)

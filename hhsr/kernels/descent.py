@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from hhsr.kernels.cell import direction_of, face_of
+from hhsr.kernels.cell import direction_of, face_of, inverse_radius
 from hhsr.kernels.jet import has_jets, inverse_radius_bend
 from hhsr.kernels.layout import (
     FRAME,
@@ -20,19 +20,22 @@ from hhsr.kernels.layout import (
     OWNER_RECORD,
 )
 from hhsr.kernels.maps import jet_near, outside_region, plane_of
-from hhsr.kernels.patch import BEST, START, TOLERANCE, offer, set_spot
+from hhsr.kernels.patch import BEST, FOOT, SPOT, START, TOLERANCE, distance_to, offer, set_spot
 from hhsr.kernels.tree import into_leaf, owner_of, turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
 
 STEPS = 10
-ROUGH = 2  # of them by the table
+ROUGH = 4  # of them by the table, at most
+LEFT = 0.02  # tolerances: a point that the next step would bring no nearer is a foot
+SLACK = 0.1  # tolerances: a foot by the table is one where it is proven to lie this near to the surface
 
 
 @unmanaged
 def descend(blob, ints, tab, owner, face, a, b, search):
     """Offer the surface points on a way of steepest nearing from (a, b) of an owner; return whether it came to a foot.
 
-    search: of a point, tree's frame. The first steps are the table's: no point of theirs is on the surface.
+    search: of a point, tree's frame. The first steps are the table's. A foot of theirs is offered as far as the surface
+    may be: `onto_surface` makes it exact.
     """
     last = np.inf
     rough = ROUGH
@@ -45,9 +48,9 @@ def descend(blob, ints, tab, owner, face, a, b, search):
         frame = ints[leaf + FRAME]
         px, py, pz = into_leaf(blob, ints, leaf, search[START], search[START + 1], search[START + 2])
         rough -= 1
-        w = 0.0
+        w = error = 0.0
         if rough >= 0:
-            w, wa, wb, waa, wab, wbb = jet_near(tab, ints, leaf, face, a, b)
+            w, wa, wb, waa, wab, wbb, error = jet_near(tab, ints, leaf, face, a, b)
         if not w > 0.0:
             rough = -1
             w, wa, wb, waa, wab, wbb = inverse_radius_bend(blob, ints, leaf, face, a, b)
@@ -65,10 +68,25 @@ def descend(blob, ints, tab, owner, face, a, b, search):
         gx, gy, gz = plane_of(face, a, b, w, wa, wb)
         gg = gx * gx + gy * gy + gz * gz
         h = (gx * rx + gy * ry + gz * rz) / gg
-        if within and distance - abs(h) * math.sqrt(gg) < 0.02 * search[TOLERANCE]:
-            if distance == search[BEST]:
-                set_spot(search, owner, face, a, b)
-            return True
+        if distance - abs(h) * math.sqrt(gg) < LEFT * search[TOLERANCE]:
+            if within:
+                return True
+            if rough >= 0:
+                # Along the ray the surface is no farther off than this; W is hundreds of times its error.
+                slack = 1.01 * error * m * math.sqrt(x * x + y * y + z * z)
+                if (
+                    slack < SLACK * search[TOLERANCE]
+                    and error < 1e-3 * w
+                    and not outside_region(blob, planes, count, x, y, z, -slack)
+                ):
+                    if distance + slack < search[BEST]:
+                        ox, oy, oz = turn_out_of_leaf(blob, frame, x, y, z)
+                        offer(
+                            search, distance + slack, 0.0, ox + blob[frame], oy + blob[frame + 1], oz + blob[frame + 2]
+                        )
+                        set_spot(search, owner, face, a, b)
+                    return True
+                rough = 0
         # Newton: with B the second derivatives of m·W in space, (1 + h B) δ = what of q − x lies in the tangent plane,
         # for δ in it. In the chart δ = x_a δa + x_b δb, and x_i·B x_j = m W_ij.
         ax, ay, az = direction_of(face, 0.0, 0.0)
@@ -114,6 +132,24 @@ def descend(blob, ints, tab, owner, face, a, b, search):
         elif max(abs(a), abs(b)) > 1.0:
             face, a, b, _ = face_of(x, y, z)
     return False
+
+
+@unmanaged
+def onto_surface(blob, ints, search):
+    """Put the best point of a search about a point on the surface, along its ray, where it is the table's."""
+    owner = int(search[SPOT])
+    if owner < 0:
+        return
+    leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * owner + OWNER_RECORD]
+    face, a, b = int(search[SPOT + 1]), search[SPOT + 2], search[SPOT + 3]
+    w = inverse_radius(blob, ints, leaf, face, a, b)
+    x, y, z = direction_of(face, a, b)
+    frame = ints[leaf + FRAME]
+    x, y, z = turn_out_of_leaf(blob, frame, x / w, y / w, z / w)
+    x, y, z = x + blob[frame], y + blob[frame + 1], z + blob[frame + 2]
+    distance, _ = distance_to(search, x, y, z)
+    search[BEST] = min(search[BEST], distance)
+    search[FOOT], search[FOOT + 1], search[FOOT + 2], search[SPOT] = x, y, z, -1.0
 
 
 @unmanaged

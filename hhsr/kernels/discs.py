@@ -11,12 +11,13 @@ import math
 import numpy as np
 from numba import njit
 
+from hhsr.kernels.disc_order import WIDE
 from hhsr.kernels.facets import RADIUS, THICK
 from hhsr.kernels.unmanaged import unmanaged
 
 DISC_SIZE = 8
-WIDE = 16
 BLOCK = WIDE * DISC_SIZE
+STEPS = 8  # of a disc's centre towards the farthest of its facets
 SLACK = 1e-6  # more than float32 rounds, relative
 
 
@@ -26,6 +27,37 @@ def level_sizes(facets: int) -> list[int]:
     while sizes and sizes[-1] > WIDE:
         sizes.append(-(-sizes[-1] // WIDE))
     return sizes
+
+
+@unmanaged
+def _centre_disc(facets, first, last, nx, ny, nz, disc):
+    """Move a disc's centre, along its axis n to the middle of its facets, and across it to where the farthest is near.
+
+    Across: steps towards the farthest, each shorter (Bădoiu and Clarkson, 2003, "Smaller core-sets for balls").
+    """
+    low, high = np.inf, -np.inf
+    for q in range(first, last):
+        rx, ry, rz = facets[q, 0] - disc[0], facets[q, 1] - disc[1], facets[q, 2] - disc[2]
+        along = rx * nx + ry * ny + rz * nz
+        turn = min(abs(nx * facets[q, 3] + ny * facets[q, 4] + nz * facets[q, 5]), 1.0)
+        reach = turn * facets[q, THICK] + math.sqrt(1.0 - turn * turn) * facets[q, RADIUS]
+        low, high = min(low, along - reach), max(high, along + reach)
+    move = 0.5 * (low + high)
+    if not abs(move) < np.inf:
+        return
+    cx, cy, cz = disc[0] + move * nx, disc[1] + move * ny, disc[2] + move * nz
+    for turn in range(STEPS):
+        far = fx = fy = fz = 0.0
+        for q in range(first, last):
+            rx, ry, rz = facets[q, 0] - cx, facets[q, 1] - cy, facets[q, 2] - cz
+            along = rx * nx + ry * ny + rz * nz
+            rx, ry, rz = rx - along * nx, ry - along * ny, rz - along * nz
+            aside = math.sqrt(rx * rx + ry * ry + rz * rz) + facets[q, RADIUS]
+            if aside > far:
+                far, fx, fy, fz = aside, rx, ry, rz
+        share = 1.0 / (3.0 + turn)
+        cx, cy, cz = cx + share * fx, cy + share * fy, cz + share * fz
+    disc[0], disc[1], disc[2] = cx, cy, cz
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -51,6 +83,8 @@ def fill_discs(facets, sizes, blocks):
             nx, ny, nz = np.float64(out[3]), np.float64(out[4]), np.float64(out[5])
             length = math.sqrt(nx * nx + ny * ny + nz * nz)
             nx, ny, nz = nx / length, ny / length, nz / length
+            if span > 1:
+                _centre_disc(facets, first, last, nx, ny, nz, out)
             thick = radius = 0.0
             for q in range(first, last):
                 rx, ry, rz = facets[q, 0] - out[0], facets[q, 1] - out[1], facets[q, 2] - out[2]

@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from hhsr.kernels.by_charts import nearest_by_charts
+from hhsr.kernels.descent import onto_surface
 from hhsr.kernels.discs import WIDE
 from hhsr.kernels.foot import FREE, UNPROVEN
 from hhsr.kernels.layout import (
@@ -143,6 +144,7 @@ def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, 
         if outcome == FREE:
             _nearest_step(blob, ints, tab, search)
         if outcome != UNPROVEN:
+            onto_surface(blob, ints, search)
             return
     nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, seeded)
     _nearest_step(blob, ints, tab, search)
@@ -153,6 +155,7 @@ def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, 
         box = blob[ints[o + OWNER_BOX] : ints[o + OWNER_BOX] + 6]
         if box[0] <= box[3] and box_bound(box, search) < search[BEST] - search[TOLERANCE]:
             _nearest_on_owner(blob, ints, owner, search, nodes, keys, corners, spare, rects)
+    onto_surface(blob, ints, search)
     if search[BEST] == FAR:
         search[BEST] = np.inf
 

@@ -1,7 +1,7 @@
 """The surface of all model leaves as flat facets with proven thickness.
 
-A facet is a cell of a leaf's map whose surface may lie in the leaf's region. Facets are sorted along a curve over
-each face; over them stands the hierarchy of `hhsr.kernels.discs`: no links are stored.
+A facet is a cell of a leaf's map whose surface may lie in the leaf's region. Over them stands the
+hierarchy of `hhsr.kernels.discs`, in the order of `hhsr.kernels.disc_order`: no links are stored.
 """
 
 import math
@@ -16,11 +16,7 @@ from hhsr.kernels.layout import (
     CELL_TABLE,
     CELLS,
     ERROR,
-    FINEST_PARTING,
     FRAME,
-    OWNER_INT_SIZE,
-    OWNER_INTS,
-    OWNER_RECORD,
     PARTING,
     SLOPE_A,
     SLOPE_B,
@@ -122,35 +118,3 @@ def list_facets(blob, owner, leaf, planes, count, codes, discs):
             codes[found] = code + (1 if whole else 0)
             found += 1
     return found
-
-
-@unmanaged
-def _along_curve(i, j, side):
-    """Return the place of (i, j) along Hilbert's curve over a square of `side`, a power of 2: unbroken."""
-    place = 0
-    s = side >> 1
-    while s > 0:
-        right, up = (1 if i & s else 0), (1 if j & s else 0)
-        place += s * s * ((3 * right) ^ up)
-        if up == 0:
-            if right == 1:
-                i, j = side - 1 - i, side - 1 - j
-            i, j = j, i
-        s >>= 1
-    return place
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def place_facets(blob, codes, keys):
-    """Fill (m,) places of the facets along a curve over each face."""
-    ints = integers(blob)
-    for q in range(codes.shape[0]):
-        owner, base, cell = codes[q] >> 24, (codes[q] >> 9) & 0x7FFF, (codes[q] >> 1) & 0xFF
-        leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * owner + OWNER_RECORD]
-        n = ints[leaf + CELLS]
-        k = ints[ints[leaf + PARTING] + base] & 7
-        finer = FINEST_PARTING - k
-        i = ((base // n % n << k) + (cell >> k)) << finer
-        j = ((base % n << k) + (cell & ((1 << k) - 1))) << finer
-        place = _along_curve(i, j, n << FINEST_PARTING)
-        keys[q] = (((owner << 3) + base // (n * n)) << 32) | place

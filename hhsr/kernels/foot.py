@@ -27,7 +27,7 @@ from hhsr.kernels.layout import (
     VALUE,
 )
 from hhsr.kernels.maps import bend_over, cell_at, index_of, plane_of, rests_over
-from hhsr.kernels.patch import FOOT, LENGTH2, SIDE, START, set_spot
+from hhsr.kernels.patch import FOOT, LENGTH2, SIDE, START
 from hhsr.kernels.quadratic import square_is_clear
 from hhsr.kernels.unmanaged import unmanaged
 
@@ -35,6 +35,7 @@ STEPS = 5
 CLOSE = 1.0  # tolerances: a foot this near to where the next step would go is one
 WIDEST = 6  # base cells a side that a ball may cover
 NEARBY = 0.1  # of the depth below its face: farther from a point a surface's own bends make many feet of one
+FARTHEST = 0.2  # of the depth below its face: no foot is proven that is farther along an axis
 UNPROVEN, FREE, PROVEN = 0, 1, 2
 
 
@@ -108,17 +109,17 @@ def _step(px, py, pz, face, a, b, w, ga, gb):
 
 
 @unmanaged
-def _descend(blob, ints, tab, leaf, face, a, b, px, py, pz, tolerance):
+def _descend(blob, ints, tab, leaf, face, a, b, depth, px, py, pz, tolerance):
     """Return (found, a, b, w, wa, wb) of the foot of a point on a leaf's surface, with the jet there; all on one face.
 
-    (a, b): the point's own directions. Found: as nearly as the tolerance asks.
+    (a, b), depth: the point's own chart. Found: as nearly as the tolerance asks, and where a proof is likely at all.
     """
     c, ca, cb, _ = cell_at(ints, leaf, face, a, b)
     # The first step is the table's.
     w, wa, wb = np.float64(tab[c + VALUE]), np.float64(tab[c + SLOPE_A]), np.float64(tab[c + SLOPE_B])
     ca, cb, m = _step(px, py, pz, face, ca, cb, w, wa, wb)
     last = max(abs(ca - a), abs(cb - b))
-    if not m > 0.0 or abs(ca) > 1.0 or abs(cb) > 1.0:
+    if not m > 0.0 or abs(ca) > 1.0 or abs(cb) > 1.0 or max(abs(m - depth), m * last) > FARTHEST * depth:
         return False, ca, cb, w, wa, wb
     for _ in range(STEPS):
         w, wa, wb = inverse_radius_jet(blob, ints, leaf, face, ca, cb)
@@ -172,7 +173,7 @@ def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, local, spare):
     """Return (distance, outcome) of a point of the owner's region (leaf's frame) to its own leaf, along the chart.
 
     FREE: no surface of this leaf lies nearer than the distance less the tolerance; PROVEN: nor any other. Distance is
-    infinite where nothing was found in the region; else local's FOOT and SPOT are that of the surface point, and SIDE
+    infinite where nothing was found in the region; else local's FOOT is the surface point, and SIDE
     is the point's. spare: (ROOM, 3) scratch.
     """
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
@@ -180,7 +181,7 @@ def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, local, spare):
     if ints[o + OWNER_KIND] != MODEL or not has_jets(ints, leaf) or (px == 0.0 and py == 0.0 and pz == 0.0):
         return np.inf, UNPROVEN
     face, a, b, m = face_of(px, py, pz)
-    found, ca, cb, w, wa, wb = _descend(blob, ints, tab, leaf, face, a, b, px, py, pz, tolerance)
+    found, ca, cb, w, wa, wb = _descend(blob, ints, tab, leaf, face, a, b, m, px, py, pz, tolerance)
     if not found:
         return np.inf, UNPROVEN
     x, y, z = direction_of(face, ca, cb)
@@ -194,7 +195,6 @@ def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, local, spare):
             return np.inf, UNPROVEN
     local[FOOT], local[FOOT + 1], local[FOOT + 2] = x, y, z
     local[START], local[START + 1], local[START + 2] = px, py, pz
-    set_spot(local, owner, face, ca, cb)
     local[SIDE] = 0.0
     rx, ry, rz = px - x, py - y, pz - z
     away2 = rx * rx + ry * ry + rz * rz
@@ -214,7 +214,7 @@ def leaf_is_free(blob, ints, tab, leaf, px, py, pz, radius, tolerance, local, sp
     if not has_jets(ints, leaf) or (px == 0.0 and py == 0.0 and pz == 0.0):
         return False
     face, a, b, m = face_of(px, py, pz)
-    found, ca, cb, w, wa, wb = _descend(blob, ints, tab, leaf, face, a, b, px, py, pz, tolerance)
+    found, ca, cb, w, wa, wb = _descend(blob, ints, tab, leaf, face, a, b, m, px, py, pz, tolerance)
     if not found:
         return False
     x, y, z = direction_of(face, ca, cb)

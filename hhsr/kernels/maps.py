@@ -86,12 +86,15 @@ def jet_of(tab, o, half):
 
 @unmanaged
 def jet_near(tab, ints, leaf, face, a, b):
-    """Return the jet at (a, b) by the table, W to third order; NaN where it has none."""
+    """Return (W, W_a, W_b, W_aa, W_ab, W_bb, error) at (a, b) by the table, the error a bound of W's; NaN: unknown."""
     o, ca, cb, half = cell_at(ints, leaf, face, a, b)
     w, wa, wb, aa, ab, bb = jet_of(tab, o, half)
     da, db = a - ca, b - cb
     ra, rb = aa * da + ab * db, ab * da + bb * db
-    return w + (wa + 0.5 * ra) * da + (wb + 0.5 * rb) * db, wa + ra, wb + rb, aa, ab, bb
+    away2 = da * da + db * db
+    error = away2 * (0.5 * np.float64(tab[o + KINK]) + np.float64(tab[o + THIRD]) * math.sqrt(away2) / 6.0)
+    w += (wa + 0.5 * ra) * da + (wb + 0.5 * rb) * db
+    return w, wa + ra, wb + rb, aa, ab, bb, error + 1e-6 * w
 
 
 @unmanaged

@@ -6,7 +6,7 @@ its flat quad, widened by its proven thickness, does; what is left is settled at
 
 import numpy as np
 
-from hhsr.kernels.descent import descend
+from hhsr.kernels.descent import descend, onto_surface
 from hhsr.kernels.discs import BLOCK, DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment, lowest_bit
 from hhsr.kernels.facets import facet_cell
 from hhsr.kernels.flat_cell import refine_cell
@@ -42,7 +42,6 @@ from hhsr.kernels.patch import (
     distance_to,
     into_own_frame,
     offer,
-    set_spot,
 )
 from hhsr.kernels.seeds import seed_at, seed_beside
 from hhsr.kernels.settle import settle_cell
@@ -125,11 +124,11 @@ def _seed_segment(blob, ints, tab, search, local):
             local[START + q] = search[START + q] + t * search[VECTOR + q]
         local[BEST], local[SPOT] = FAR, -1.0
         seed_point(blob, ints, tab, local)
+        onto_surface(blob, ints, local)
         if local[BEST] < FAR:
             distance, t = distance_to(search, local[FOOT], local[FOOT + 1], local[FOOT + 2])
             if distance < search[BEST]:
                 offer(search, distance, t, local[FOOT], local[FOOT + 1], local[FOOT + 2])
-                set_spot(search, local[SPOT], local[SPOT + 1], local[SPOT + 2], local[SPOT + 3])
 
 
 @unmanaged

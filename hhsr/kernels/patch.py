@@ -24,8 +24,8 @@ from hhsr.kernels.tree import into_leaf, turn_into_leaf
 from hhsr.kernels.unmanaged import unmanaged
 
 # Slots of a search: start 3, vector 3, squared length; best distance, t, point 3 (owner's frame); tolerance; and where
-# the best point is a foot, its spot: owner (−1: it is none), face, a, b; last, where the start is proven to lie: 1
-# outside, −1 inside, 0 not known.
+# the best point is the table's, its spot: owner (−1: it is exact), face, a, b; the exact one along that ray is no farther
+# than the best distance. Last, where the start is proven to lie: 1 outside, −1 inside, 0 not known.
 START, VECTOR, LENGTH2, BEST, BEST_T, FOOT, TOLERANCE, SPOT, SIDE = 0, 3, 6, 7, 8, 9, 12, 13, 17
 SEARCH_SIZE = 18
 LATE = 256  # room for pending nodes
@@ -69,7 +69,7 @@ def offer(search, distance, t, x, y, z):
 
 @unmanaged
 def set_spot(search, owner, face, a, b):
-    """Note that a search's best point is a foot: that of an owner at (a, b) on a face."""
+    """Note that a search's best point is the table's, of an owner at (a, b) on a face."""
     search[SPOT], search[SPOT + 1], search[SPOT + 2], search[SPOT + 3] = owner, face, a, b
 
 
