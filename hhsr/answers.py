@@ -7,11 +7,9 @@ from typing import Any, Literal, NamedTuple, TypeGuard
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hhsr.batches import in_parts, neighbours_first
 from hhsr.check import as_points
 from hhsr.errors import InputError
 from hhsr.kernels.crossing import cross_one
-from hhsr.kernels.distance import nearest_many
 from hhsr.model import FloatArray, IntArray
 
 OnInvalid = Literal["raise", "mark"]
@@ -51,16 +49,6 @@ class Profile(NamedTuple):
     t: FloatArray
     distance: FloatArray
     inside_mm: Any
-
-
-def nearest_to_rows(blob: FloatArray, points: FloatArray, tolerance: float) -> tuple[FloatArray, FloatArray, int]:
-    """Return (n,) signed distance (mm), (n, 3) surface point, and how many of the points (n, 3) are not finite."""
-    distance, foot, order = np.empty(len(points)), np.empty((len(points), 3)), neighbours_first(points)
-    near = points[order]
-    bad = in_parts(
-        len(points), 1_000, lambda i, j: nearest_many(blob, near[i:j], order[i:j], tolerance, distance, foot)
-    )
-    return distance, foot, int(sum(bad))
 
 
 def is_point(value: object) -> TypeGuard[FloatArray]:

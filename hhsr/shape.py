@@ -23,7 +23,6 @@ from hhsr.answers import (
     curve,
     is_point,
     marks,
-    nearest_to_rows,
     scalar,
 )
 from hhsr.batches import in_parts
@@ -33,10 +32,11 @@ from hhsr.errors import FileFormatError, InputError
 from hhsr.kernels import contains as contains_kernels
 from hhsr.kernels import crossing as crossing_kernels
 from hhsr.kernels import tree as tree_kernels
-from hhsr.kernels.clearance import clearance_many, clearance_one
+from hhsr.kernels.clearance import clearance_one
 from hhsr.kernels.distance import distance_one
 from hhsr.local_error import errors_at
 from hhsr.model import ErrorFigures, FloatArray, Provenance, Tree, rotation_matrix
+from hhsr.rows import clearance_of_rows, crossings_of_rows, first_of_rows, nearest_to_rows
 from hhsr.surface import reconstruct
 
 if TYPE_CHECKING:
@@ -233,36 +233,11 @@ class Shape:
             if one is not None:
                 return one
         first, last, _ = broadcast_segments(starts, ends)
-        counts, begins = np.empty(len(first), dtype=np.int64), np.empty(len(first), dtype=np.bool_)
-        blob = self._blob
-
-        def part(i: int, j: int) -> FloatArray:
-            found: list[FloatArray] = []
-            room = 4 * (j - i) + 64
-            while True:
-                t = np.empty(room)
-                done, used = crossing_kernels.cross_many(
-                    blob, first[i:j], last[i:j], resolution, tolerance, counts[i:j], begins[i:j], t
-                )
-                found.append(t[:used])
-                i += done
-                if i == j:
-                    return np.concatenate(found)
-                if done == 0:
-                    room *= 4
-
-        t = np.concatenate(in_parts(len(first), 4_000, part)) if len(first) else np.empty(0)
-        valid = counts >= 0
-        if not valid.all():
-            if not marks(on_invalid):
-                require_finite(first, "starts")
-                require_finite(last, "ends")
-            counts = np.where(valid, counts, 0)
-        offsets = np.zeros(len(first) + 1, dtype=np.int64)
-        np.cumsum(counts, out=offsets[1:])
-        points, entering = np.empty((len(t), 3)), np.empty(len(t), dtype=np.bool_)
-        crossing_kernels.place_many(first, last, offsets, begins, t, points, entering)
-        return Crossings(offsets, t, points, entering, valid)
+        found = crossings_of_rows(self._blob, first, last, resolution, tolerance)
+        if not found.valid.all() and not marks(on_invalid):
+            require_finite(first, "starts")
+            require_finite(last, "ends")
+        return found
 
     def first_crossing(
         self,
@@ -285,15 +260,7 @@ class Shape:
                 return one
         first, last, shape = broadcast_segments(starts, ends)
         mark = marks(on_invalid)
-        out = np.empty(len(first))
-        blob = self._blob
-        bad = sum(
-            in_parts(
-                len(first),
-                4_000,
-                lambda i, j: crossing_kernels.first_many(blob, first[i:j], last[i:j], resolution, tolerance, out[i:j]),
-            )
-        )
+        out, bad = first_of_rows(self._blob, first, last, resolution, tolerance)
         if bad and not mark:
             require_finite(first, "starts")
             require_finite(last, "ends")
@@ -338,15 +305,7 @@ class Shape:
         mark = marks(on_invalid)
         thick = as_float(radius, "radius", 0.0)
         tolerance = as_float(tolerance_mm, "tolerance_mm", 1e-4, 1e3)
-        value, t, foot = np.empty(len(first)), np.empty(len(first)), np.empty((len(first), 3))
-        blob = self._blob
-        bad = sum(
-            in_parts(
-                len(first),
-                500,
-                lambda i, j: clearance_many(blob, first[i:j], last[i:j], tolerance, value[i:j], t[i:j], foot[i:j]),
-            )
-        )
+        value, t, foot, bad = clearance_of_rows(self._blob, first, last, tolerance)
         if bad and not mark:
             require_finite(first, "starts")
             require_finite(last, "ends")

@@ -225,27 +225,29 @@ def clearance_one(blob, ax, ay, az, bx, by, bz, tolerance):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def clearance_many(blob, starts, ends, tolerance, value, t, foot):
-    """Fill (n,) clearance of the axes of LPS segments (no radius), (n,) where along it, (n, 3) the surface point there.
+def clearance_many(blob, starts, ends, order, tolerance, value, t, foot):
+    """Fill (n,) clearance of the axes of LPS segments (m, 3) (no radius), (n,) where along it, (n, 3) surface points.
 
-    truth − tolerance ≤ value ≤ truth; NaN where not finite. Returns how many are not finite.
+    order: (m,) the row of the answers that each is for. truth − tolerance ≤ value ≤ truth; NaN where not finite.
+    Returns how many are not finite.
     """
     ints, tab = integers(blob), tables(blob)
     search, local, nodes, keys, corners, spare, rects = near_scratch()
     work, slots, pending = scratch()
     ts, out, spans = _clearance_scratch()
     bad = 0
-    for i in range(starts.shape[0]):
+    for row in range(starts.shape[0]):
+        i = order[row]
         ok = True
         for k in range(3):
-            ok = ok and math.isfinite(starts[i, k]) and math.isfinite(ends[i, k])
+            ok = ok and math.isfinite(starts[row, k]) and math.isfinite(ends[row, k])
         if not ok:
             value[i], t[i] = np.nan, np.nan
             foot[i, 0], foot[i, 1], foot[i, 2] = np.nan, np.nan, np.nan
             bad += 1
             continue
-        px, py, pz = into_tree(blob, ints, starts[i, 0], starts[i, 1], starts[i, 2])
-        ex, ey, ez = into_tree(blob, ints, ends[i, 0], ends[i, 1], ends[i, 2])
+        px, py, pz = into_tree(blob, ints, starts[row, 0], starts[row, 1], starts[row, 2])
+        ex, ey, ez = into_tree(blob, ints, ends[row, 0], ends[row, 1], ends[row, 2])
         value[i] = _clearance(
             blob, ints, tab, px, py, pz, ex, ey, ez, tolerance, ts, out, search, local, nodes, keys, corners, spare,
             rects, spans, work, slots, pending,

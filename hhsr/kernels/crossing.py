@@ -84,15 +84,21 @@ def cross_many(blob, starts, ends, resolution, tolerance, counts, begins, ts):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def place_many(starts, ends, offsets, begins, t, points, entering):
-    """Fill points (m, 3) and entering (m,) of crossings t (m,) of (n, 3) → (n, 3), offsets (n + 1,), begins (n,)."""
-    for i in range(starts.shape[0]):
-        inside = begins[i]
-        for k in range(offsets[i], offsets[i + 1]):
+def place_many(starts, ends, order, begins, found, offsets, t, points, entering):
+    """Fill t (m,), points (m, 3) and entering (m,) of the crossings that were found (m,) of segments (n, 3) → (n, 3).
+
+    order: (n,) the row of the answers that each segment is for; begins: (n,) whether it starts inside. offsets:
+    (n + 1,) where each row's crossings begin.
+    """
+    used = 0
+    for row in range(starts.shape[0]):
+        inside = begins[row]
+        for k in range(offsets[order[row]], offsets[order[row] + 1]):
             inside = not inside
-            entering[k] = inside
+            t[k], entering[k] = found[used], inside
             for c in range(3):
-                points[k, c] = starts[i, c] + t[k] * (ends[i, c] - starts[i, c])
+                points[k, c] = starts[row, c] + t[k] * (ends[row, c] - starts[row, c])
+            used += 1
 
 
 @njit(cache=True, error_model="numpy")
@@ -159,15 +165,18 @@ def first_exits(blob, root, centre, rays, resolution, tolerance, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def first_many(blob, starts, ends, resolution, tolerance, out):
-    """Fill (n,) t of the first crossing of LPS segments: NaN none, −1 not finite; return how many are not finite."""
+def first_many(blob, starts, ends, order, resolution, tolerance, out):
+    """Fill (n,) t of the first crossing of LPS segments (m, 3): NaN none, −1 not finite.
+
+    order: (m,) the row of the answers that each is for. Returns how many are not finite.
+    """
     ints, tab = integers(blob), tables(blob)
     work, slots, pending = scratch()
     t = np.empty(64)
     bad = 0
     for i in range(starts.shape[0]):
         if not _finite(starts, ends, i):
-            out[i] = -1.0
+            out[order[i]] = -1.0
             bad += 1
             continue
         px, py, pz = into_tree(blob, ints, starts[i, 0], starts[i, 1], starts[i, 2])
@@ -176,7 +185,7 @@ def first_many(blob, starts, ends, resolution, tolerance, out):
             blob, ints, tab, np.int64(0), px, py, pz, ex, ey, ez, resolution, tolerance, np.bool_(True), t, work,
             slots, pending,
         )  # fmt: skip
-        out[i] = t[0] if count > 0 else np.nan
+        out[order[i]] = t[0] if count > 0 else np.nan
     return bad
 
 

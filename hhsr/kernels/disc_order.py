@@ -3,9 +3,9 @@
 import numpy as np
 from numba import njit
 
+from hhsr.kernels.discs import WIDE
 from hhsr.kernels.unmanaged import unmanaged
 
-WIDE = 16  # children of a disc
 DEEP = 128  # pending ranges: two a halving would do
 
 

@@ -11,11 +11,11 @@ import math
 import numpy as np
 from numba import njit
 
-from hhsr.kernels.disc_order import WIDE
 from hhsr.kernels.facets import RADIUS, THICK
 from hhsr.kernels.unmanaged import unmanaged
 
 DISC_SIZE = 8
+WIDE = 16
 BLOCK = WIDE * DISC_SIZE
 STEPS = 8  # of a disc's centre towards the farthest of its facets
 SLACK = 1e-6  # more than float32 rounds, relative

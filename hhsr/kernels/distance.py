@@ -55,7 +55,7 @@ from hhsr.kernels.tree import (
     out_of_tree,
 )
 from hhsr.kernels.unmanaged import managed, unmanaged
-from hhsr.kernels.voxels import solid_contains
+from hhsr.kernels.voxels import settled_about, solid_contains
 
 ASIDE = 1e-6  # mm: how far off a plane its two sides are asked
 
@@ -110,6 +110,8 @@ def _nearest_step(blob, ints, tab, search):
             h = nx * px + ny * py + nz * pz - blob[o + 3]
             if abs(h) < search[BEST]:
                 x, y, z = px - h * nx, py - h * ny, pz - h * nz
+                if settled_about(blob, ints, x, y, z):
+                    continue
                 if solid_contains(
                     blob, ints, tab, np.int64(0), x + ASIDE * nx, y + ASIDE * ny, z + ASIDE * nz
                 ) != solid_contains(blob, ints, tab, np.int64(0), x - ASIDE * nx, y - ASIDE * ny, z - ASIDE * nz):

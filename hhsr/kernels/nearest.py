@@ -178,34 +178,43 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
         base = depth
         while mask != 0:
             c, mask = lowest_bit(mask)
+            if WIDE * i + c >= size:
+                continue
             low = np.float64(bounds[c])
-            if WIDE * i + c >= size or low > limit * limit:
+            if level == 0:
+                keys[LATE + waiting], nodes[LATE + waiting] = low, ints[codes + WIDE * i + c]
+                waiting += 1
                 continue
-            if level > 0:
-                # Inserted so that the nearest is next.
-                k = depth
-                while k > base and keys[k - 1] < low:
-                    keys[k], nodes[k] = keys[k - 1], nodes[k - 1]
-                    k -= 1
-                keys[k], nodes[k] = low, ((level - 1) << 40) + WIDE * i + c
-                depth += 1
-                continue
-            # Facets wait in order, the nearest last: most are settled when the search is over, against a tight bound.
-            k = LATE + waiting
-            while k > LATE and keys[k - 1] < low:
+            # Inserted so that the nearest is next.
+            k = depth
+            while k > base and keys[k - 1] < low:
                 keys[k], nodes[k] = keys[k - 1], nodes[k - 1]
                 k -= 1
-            keys[k], nodes[k] = low, ints[codes + WIDE * i + c]
-            waiting += 1
-            if waiting > PATIENCE:  # the bound is not tight yet
-                waiting -= 1
-                _settle(blob, ints, tab, nodes[LATE + waiting], search, local, corners, spare, rects)
-                limit = search[BEST] - search[TOLERANCE]
+            keys[k], nodes[k] = low, ((level - 1) << 40) + WIDE * i + c
+            depth += 1
+        # Facets wait: most are settled when the search is over, against a tight bound.
+        while waiting > PATIENCE:  # the bound is not tight yet
+            waiting = _settle_nearest(blob, ints, tab, waiting, search, local, nodes, keys, corners, spare, rects)
+            limit = search[BEST] - search[TOLERANCE]
     while waiting > 0:
-        waiting -= 1
-        limit = search[BEST] - search[TOLERANCE]
-        if limit >= 0.0 and keys[LATE + waiting] <= limit * limit:
-            _settle(blob, ints, tab, nodes[LATE + waiting], search, local, corners, spare, rects)
+        waiting = _settle_nearest(blob, ints, tab, waiting, search, local, nodes, keys, corners, spare, rects)
+
+
+@unmanaged
+def _settle_nearest(blob, ints, tab, waiting, search, local, nodes, keys, corners, spare, rects):
+    """Settle the nearest of the facets that wait, from slot LATE on; return how many wait then."""
+    last = LATE + waiting - 1
+    k = last
+    for q in range(LATE, last):
+        if keys[q] < keys[k]:
+            k = q
+    low, code = keys[k], nodes[k]
+    keys[k], nodes[k] = keys[last], nodes[last]
+    limit = search[BEST] - search[TOLERANCE]
+    if limit < 0.0 or low > limit * limit:
+        return np.int64(0)  # nor are the others nearer
+    _settle(blob, ints, tab, code, search, local, corners, spare, rects)
+    return waiting - 1
 
 
 @unmanaged

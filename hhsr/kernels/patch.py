@@ -24,8 +24,8 @@ from hhsr.kernels.tree import into_leaf, turn_into_leaf
 from hhsr.kernels.unmanaged import unmanaged
 
 # Slots of a search: start 3, vector 3, squared length; best distance, t, point 3 (owner's frame); tolerance; and where
-# the best point is the table's, its spot: owner (−1: it is exact), face, a, b; the exact one along that ray is no farther
-# than the best distance. Last, where the start is proven to lie: 1 outside, −1 inside, 0 not known.
+# the best point is the table's, its spot: owner (−1: it is exact), face, a, b; the exact one along that ray is no
+# farther than the best distance. Last, where the start is proven to lie: 1 outside, −1 inside, 0 not known.
 START, VECTOR, LENGTH2, BEST, BEST_T, FOOT, TOLERANCE, SPOT, SIDE = 0, 3, 6, 7, 8, 9, 12, 13, 17
 SEARCH_SIZE = 18
 LATE = 256  # room for pending nodes

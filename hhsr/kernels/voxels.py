@@ -255,6 +255,25 @@ def voxel_state(blob, ints, tab, octets, words, x, y, z):
 
 
 @unmanaged
+def settled_about(blob, ints, x, y, z):
+    """Return whether a point of the tree's frame, and all within 1e-6 mm of it, lies in a voxel of one proven state."""
+    c, f = ints[VOXELS], ints[VOXEL_FRAME]
+    if c == 0:
+        return False
+    scale = blob[f + 4]
+    u, v, w = (x - blob[f]) * scale, (y - blob[f + 1]) * scale, (z - blob[f + 2]) * scale
+    if not (0.0 <= u < BRICK * ints[c] and 0.0 <= v < BRICK * ints[c + 1] and 0.0 <= w < BRICK * ints[c + 2]):
+        return True  # half a voxel and more beyond the solid
+    i, j, k = int(u), int(v), int(w)
+    slot = np.int64(
+        blob.view(np.int32)[ints[c + BRICKS] + ((i >> 2) * ints[c + 1] + (j >> 2)) * ints[c + 2] + (k >> 2)]
+    )
+    if slot < 0:
+        return True
+    return blob.view(np.uint8)[ints[c + BYTES] + 64 * slot + (((i & 3) << 4) | ((j & 3) << 2) | (k & 3))] > NO_SURFEL
+
+
+@unmanaged
 def solid_contains(blob, ints, tab, root, x, y, z):
     """Return whether the solid of node `root` holds a point of the tree's frame: by its voxel, else by the formulas."""
     if root == 0 and ints[VOXELS] != 0:

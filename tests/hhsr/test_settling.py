@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from hhsr.batches import neighbours_first
 from hhsr.compiled import compile_tree
 from hhsr.kernels import layout as at
 from hhsr.kernels.cell import direction_of, inverse_radius
 from hhsr.kernels.clipped_quadratic import clipped_is_clear, least_over_polygon
 from hhsr.kernels.discs import DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment, lowest_bit
-from hhsr.kernels.facets import _along_curve, facet_cell
+from hhsr.kernels.facets import facet_cell
 from hhsr.kernels.foot import jump_over, leaf_is_free
 from hhsr.kernels.jet import inverse_radius_bend
 from hhsr.kernels.layout import integers, tables
@@ -152,7 +151,7 @@ def test_the_table_holds_the_jet_of_a_surface_as_near_as_said(one: ModelLeaf) ->
         near = np.array(jet_near(tab, ints, record, face, a + da, b + db))
         exact = np.array(inverse_radius_bend(blob, ints, record, face, a + da, b + db))
         rest = float(tab[slot + at.KINK]) + half * float(tab[slot + at.THIRD])
-        assert abs(near[0] - exact[0]) <= 0.5 * rest * half**2 + 2e-7 * exact[0]
+        assert abs(near[0] - exact[0]) <= min(0.5 * rest * half**2 + 2e-7 * exact[0], near[6])
         seen += 1
     assert seen > 60
 
@@ -326,27 +325,6 @@ def test_the_lowest_bit_of_a_mask() -> None:
             place, rest = lowest_bit(np.uint32(rest))
             found.append(int(place))
         assert found == [k for k in range(32) if int(mask) >> k & 1]
-
-
-def test_the_curve_is_unbroken() -> None:
-    places = {_along_curve(i, j, 16): (i, j) for i in range(16) for j in range(16)}
-    assert sorted(places) == list(range(256))
-    assert all(np.abs(np.subtract(places[k], places[k + 1])).sum() == 1 for k in range(255))
-
-
-def test_neighbours_first_is_an_order_of_all_points() -> None:
-    rng = np.random.default_rng(1)
-    points = rng.uniform(-100, 100, (5000, 3))
-    order = neighbours_first(points)
-    assert sorted(order) == list(range(5000))
-    steps = np.linalg.norm(np.diff(points[order], axis=0), axis=1)
-    assert steps.mean() < 0.25 * np.linalg.norm(np.diff(points, axis=0), axis=1).mean()
-    points[7] = np.nan
-    points[9] = [np.inf, 0, -np.inf]
-    points[11] = 1e300
-    assert sorted(neighbours_first(points)) == list(range(5000))
-    assert neighbours_first(np.empty((0, 3))).shape == (0,)
-    assert list(neighbours_first(np.ones((3, 3)))) == [0, 1, 2]
 
 
 def test_a_point_beyond_what_single_precision_holds_has_its_distance() -> None:

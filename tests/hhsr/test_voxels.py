@@ -197,7 +197,7 @@ def compare(shape: Shape, starts: np.ndarray, ends: np.ndarray, in_planes: int =
             different += bool(np.diff(both).min() * length[i] > 0.0101)
     assert different <= in_planes
     first = np.empty(len(starts))
-    first_many(shape.compiled.blob, starts, ends, 0.01, 0.001, first)
+    first_many(shape.compiled.blob, starts, ends, np.arange(len(starts)), 0.01, 0.001, first)
     has = counts > 0
     assert np.array_equal(np.isnan(first), ~has)
     assert np.array_equal(first[has], t[offset[has]])
