@@ -70,4 +70,4 @@ def segments_in_order(starts: FloatArray, ends: FloatArray) -> tuple[NDArray[np.
     if len(starts) < FEW:
         return np.arange(len(starts)), starts, ends
     order = neighbours_first(0.5 * (starts + ends))
-    return order, starts[order], ends[order]
+    return order, np.take(starts, order, axis=0), np.take(ends, order, axis=0)

@@ -18,7 +18,7 @@ from hhsr.model import FloatArray
 def nearest_to_rows(blob: FloatArray, points: FloatArray, tolerance: float) -> tuple[FloatArray, FloatArray, int]:
     """Return (n,) signed distance (mm) and (n, 3) surface point of points (n, 3); NaN where not finite."""
     distance, foot, order = np.empty(len(points)), np.empty((len(points), 3)), neighbours_first(points)
-    near = points[order]
+    near = np.take(points, order, axis=0)
     bad = in_parts(
         len(points), 1_000, lambda i, j: nearest_many(blob, near[i:j], order[i:j], tolerance, distance, foot)
     )

@@ -104,6 +104,7 @@ def fill_discs(facets, sizes, blocks):
 LOOSE = 2e-6
 MOST = 1e38  # a squared distance that float32 still holds
 _SHORT, _LONG, _NONE, _ALL = np.float32(1.0 - 1e-6), np.float32(1.0 + 1e-6), np.float32(0.0), np.float32(1.0)
+_TINY, _BLUR = np.float32(1e-30), np.float32(4e-6)  # mm²; what float32 leaves of a squared cosine, and more
 
 
 @unmanaged
@@ -128,23 +129,31 @@ def bound_to_point(blocks, i, x, y, z, loose, most, bounds):
 
 @unmanaged
 def bound_to_segment(blocks, i, x, y, z, dx, dy, dz, loose, most, bounds):
-    """Do as `bound_to_point` for p + t·d: by the slab about a disc's plane, and by the ball about the disc."""
+    """Do as `bound_to_point` for p + t·d: by the slab about a disc's plane, and by the plane across the shortest way.
+
+    The shortest way from the disc's centre to the segment has a direction u in which no point of the segment lies
+    farther back; the disc reaches RADIUS·√(1 − (n·u)²) + THICK that way. Roundings turn u by less than loose/length.
+    """
     k, mask, limit = np.uint64(i), np.uint32(0), np.float32(min(most, MOST)) * _LONG
     px, py, pz, e = np.float32(x), np.float32(y), np.float32(z), np.float32(loose)
     vx, vy, vz = np.float32(dx), np.float32(dy), np.float32(dz)
     over = np.float32(1.0 / (dx * dx + dy * dy + dz * dz))
     for c in range(bounds.shape[0]):
         rx, ry, rz = px - blocks[k, 0, c], py - blocks[k, 1, c], pz - blocks[k, 2, c]
-        h = rx * blocks[k, 3, c] + ry * blocks[k, 4, c] + rz * blocks[k, 5, c]
-        g = h + (vx * blocks[k, 3, c] + vy * blocks[k, 4, c] + vz * blocks[k, 5, c])
+        nx, ny, nz = blocks[k, 3, c], blocks[k, 4, c], blocks[k, 5, c]
+        h = rx * nx + ry * ny + rz * nz
+        g = h + (vx * nx + vy * ny + vz * nz)
+        thick, radius = blocks[k, 6, c] + e, blocks[k, 7, c] + e
         # Both ends on one side: the nearer one's height; else the segment meets the plane.
-        slab = max(min(h, g), -max(h, g)) * _SHORT - (blocks[k, 6, c] + e)
+        slab = max(min(h, g), -max(h, g)) * _SHORT - thick
         # A t off the nearest point's by rounding: its distance hardly grows.
         t = min(max(-(rx * vx + ry * vy + rz * vz) * over, _NONE), _ALL)
         rx, ry, rz = rx + t * vx, ry + t * vy, rz + t * vz
-        thick, radius = blocks[k, 6, c] + e, blocks[k, 7, c] + e
-        ball = math.sqrt(rx * rx + ry * ry + rz * rz) * _SHORT - math.sqrt(radius * radius + thick * thick)
-        low = max(max(slab, ball), _NONE)
+        length2 = max(rx * rx + ry * ry + rz * rz, _TINY)
+        length = math.sqrt(length2)
+        h = rx * nx + ry * ny + rz * nz
+        aside = math.sqrt(max(_ALL - h * h / length2, _NONE) + _BLUR) + e / length
+        low = max(max(slab, length * _SHORT - radius * aside - thick), _NONE)
         bounds[c] = low * low * _SHORT
         mask |= np.uint32(np.uint32(bounds[c] <= limit) << np.uint32(c))
     return mask
