@@ -20,6 +20,8 @@ from hhsr.kernels.tree import into_tree, out_of_tree
 from hhsr.kernels.unmanaged import managed, unmanaged
 
 ROUGHLY = 6.0  # tolerances: as nearly as a foot is sought that is to lower a bound of the depth
+PATIENCE = 2  # ways on, one after another, that lower a bound of the depth by little
+LITTLE = 0.3  # of what is open
 SPANS = 256  # parts of one segment's stretch inside
 
 
@@ -132,7 +134,7 @@ def deepest(
         spans, 0, px, py, pz, dx, dy, dz, t0, spans[0, 1], spans[0, 2], spans[0, 3], t1, spans[0, 5], spans[0, 6],
         spans[0, 7],
     )  # fmt: skip
-    used = 1
+    used, slow = 1, np.int64(0)
     for turn in range(2 * SPANS):
         s = 0
         for k in range(1, used):
@@ -146,10 +148,14 @@ def deepest(
         set_search(search, px + t * dx, py + t * dy, pz + t * dz, 0.0, 0.0, 0.0, ROUGHLY * tolerance)
         if a < t < b:
             seed_point(blob, ints, tab, search)
-        if not search[BEST] < value - near:
+        known = search[BEST] < value - near
+        if not known and slow < PATIENCE:
             _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, value - near, search, local)
-        if not search[BEST] < value - near:
-            # Nothing nearer is known: what is the true distance there?
+            known = search[BEST] < value - near
+            slow = slow + 1 if value - search[BEST] < LITTLE * (value - sure) else np.int64(0)
+        if not known:
+            # Nothing nearer is known, or little by little: what is the true distance there?
+            slow = np.int64(0)
             room = 0.9 * tolerance - max(value - search[BEST], 0.0)
             search[TOLERANCE] = room
             search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, np.bool_(True))

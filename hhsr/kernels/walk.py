@@ -161,9 +161,9 @@ def follow_voxels(
     nudge = max(NUDGE * min(1.0, blob[f + 3]) / length, 1e-15)
     speed = math.sqrt(vx * vx + vy * vy + vz * vz)
     t = start + nudge if start > 0.0 else 0.0
-    begin = start <= 0.0 and solid_contains(blob, ints, tab, np.int64(0), px, py, pz)
-    state, count = begin, np.int64(0)
-    kind, closing, at, last = np.int64(NONE), UNKNOWN, 0.0, -1
+    begin = state = False
+    begun, sure = start > 0.0, False  # whether the start's state is known; whether a whole voxel's stands up to the end
+    count, kind, closing, at, last = np.int64(0), np.int64(NONE), UNKNOWN, 0.0, -1
     while True:
         if closing != UNKNOWN:
             state, count = _close_run(
@@ -175,7 +175,7 @@ def follow_voxels(
             return begin, count
         if t >= stop:
             # The end has its own state: along a cutting plane it may not be the one that the walk came with.
-            holds = stop >= 1.0 and solid_contains(blob, ints, tab, np.int64(0), qx, qy, qz)
+            holds = stop >= 1.0 and (state if sure else solid_contains(blob, ints, tab, np.int64(0), qx, qy, qz))
             if kind == NONE:
                 state, count = change(state, holds, stop, gap, out, count)
                 return begin, count
@@ -218,6 +218,11 @@ def follow_voxels(
                 ex = (i + sx * r + ox) * ix + kx
                 ey = (j + sy * r + oy) * iy + ky
                 ez = (k + sz * r + oz) * iz + kz
+        if not begun:
+            begun = True
+            begin = known == 1 if known != UNKNOWN else solid_contains(blob, ints, tab, np.int64(0), px, py, pz)
+            state = begin
+        sure = known != UNKNOWN and kind == NONE
         end = min(min(ex, ey), min(min(ez, near), stop))
         a, b, after, owner, cut = t, end, UNKNOWN, -1, False
         slope = stray = bend = guess = 0.0
