@@ -18,7 +18,7 @@ from hhsr.triangle_tree import TriangleTree
 Plane = tuple[FloatArray, float]  # n, c: the half space n·p ≤ c
 
 BASE_SIDE = 32  # base cells a face side of a leaf's map, where there are few leaves
-BASE_CELLS_TOTAL = 100_000  # over all leaves, 16 bytes each before they are parted
+BASE_CELLS_TOTAL = 100_000  # over all leaves, before they are parted
 
 
 @dataclass
