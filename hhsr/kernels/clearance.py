@@ -13,7 +13,7 @@ from hhsr.kernels.crossing import follow_segment, scratch
 from hhsr.kernels.descent import descend_from, onto_surface
 from hhsr.kernels.distance import near_scratch, search_surface, set_search
 from hhsr.kernels.layout import integers, tables
-from hhsr.kernels.nearest import seed_point, seeds_beside
+from hhsr.kernels.nearest import seed_point
 from hhsr.kernels.patch import BEST, BEST_T, FAR, FOOT, TOLERANCE, distance_to, offer
 from hhsr.kernels.seam import slide_from
 from hhsr.kernels.tree import into_tree, out_of_tree
@@ -34,7 +34,7 @@ def _offer_known(search, x, y, z):
 
 @unmanaged
 def _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, below, search, local):
-    """Offer two surface points, and go on from them and from the facets beside until one is nearer than `below`."""
+    """Offer two surface points, and go on from them, down and along seams, until one is nearer than `below`."""
     _offer_known(search, ax, ay, az)
     _offer_known(search, bx, by, bz)
     for way in range(4):
@@ -45,7 +45,6 @@ def _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, below, search, local):
             slide_from(blob, ints, tab, x, y, z, search, local)
         if search[BEST] < below:
             return
-    seeds_beside(blob, ints, tab, below, search)
 
 
 @unmanaged

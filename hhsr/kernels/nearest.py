@@ -43,7 +43,7 @@ from hhsr.kernels.patch import (
     into_own_frame,
     offer,
 )
-from hhsr.kernels.seeds import seed_at, seed_beside
+from hhsr.kernels.seeds import seed_at
 from hhsr.kernels.settle import settle_cell
 from hhsr.kernels.tree import turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
@@ -81,31 +81,10 @@ def seed_point(blob, ints, tab, search):
     """Offer surface points on the way down from the facet that is named near the search's point; nothing is proven."""
     if ints[FACET_COUNT] == 0:
         return
-    _descend_from(blob, ints, tab, seed_at(blob, ints, search[START], search[START + 1], search[START + 2]), search)
-
-
-@unmanaged
-def _descend_from(blob, ints, tab, facet, search):
-    code = ints[ints[FACET_CODES] + facet]
+    code = ints[ints[FACET_CODES] + seed_at(blob, ints, search[START], search[START + 1], search[START + 2])]
     leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * (code >> 24) + OWNER_RECORD]
     _, face, a, b, _ = facet_cell(ints, leaf, code)
     descend(blob, ints, tab, code >> 24, face, a, b, search)
-
-
-@unmanaged
-def seeds_beside(blob, ints, tab, below, search):
-    """Do as `seed_point` from those facets named beside the point whose middles are nearer than `below`."""
-    if ints[FACET_COUNT] == 0:
-        return
-    x, y, z = search[START], search[START + 1], search[START + 2]
-    levels = ints[FACET_LEVELS]
-    first = ints[levels + 1 + 2 * ints[levels]]
-    for way in range(6):
-        facet = seed_beside(blob, ints, x, y, z, way)
-        o = first + BLOCK * (facet // WIDE) + facet % WIDE
-        rx, ry, rz = x - tab[o], y - tab[o + WIDE], z - tab[o + 2 * WIDE]
-        if rx * rx + ry * ry + rz * rz < min(below, search[BEST]) ** 2:
-            _descend_from(blob, ints, tab, facet, search)
 
 
 @unmanaged

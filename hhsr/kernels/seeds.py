@@ -68,13 +68,3 @@ def seed_at(blob, ints, x, y, z):
     j = int(min(max((y - blob[f + 1]) * inverse, 0.0), ny - 1.0))
     k = int(min(max((z - blob[f + 2]) * inverse, 0.0), nz - 1.0))
     return np.int64(blob.view(np.int32)[2 * ints[SEEDS] + (i * ny + j) * nz + k])
-
-
-@unmanaged
-def seed_beside(blob, ints, x, y, z, way):
-    """Return the facet named by the cell beside that of a point: way 0 … 5 is −x, +x, −y, +y, −z, +z."""
-    step = (2 * (way & 1) - 1) / blob[ints[SEED_FRAME] + 3]
-    axis = way >> 1
-    return seed_at(
-        blob, ints, x + (step if axis == 0 else 0.0), y + (step if axis == 1 else 0.0), z + (step if axis == 2 else 0.0)
-    )
