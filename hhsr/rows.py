@@ -10,7 +10,7 @@ import numpy as np
 from hhsr.answers import Crossings
 from hhsr.batches import in_parts, neighbours_first, segments_in_order
 from hhsr.kernels.clearance import clearance_many
-from hhsr.kernels.crossing import cross_many, first_many, place_many
+from hhsr.kernels.crossing_many import cross_many, place_all, place_first
 from hhsr.kernels.distance import nearest_many
 from hhsr.model import FloatArray
 
@@ -45,12 +45,13 @@ def first_of_rows(
     """Return (n,) t of the first crossing of segments (n, 3): NaN where there is none, −1 where not finite."""
     order, first, last = segments_in_order(starts, ends)
     t = np.empty(len(order))
-    bad = in_parts(
-        len(order),
-        4_000,
-        lambda i, j: first_many(blob, first[i:j], last[i:j], order[i:j], resolution, tolerance, t),
-    )
-    return t, int(sum(bad))
+
+    def part(i: int, j: int) -> int:
+        counts, places, begins = np.empty(j - i, np.int64), np.empty(j - i, np.int64), np.empty(j - i, np.bool_)
+        found = cross_many(blob, first[i:j], last[i:j], True, resolution, tolerance, counts, begins, places)
+        return int(place_first(order[i:j], counts, places, found, t))
+
+    return t, sum(in_parts(len(order), 4_000, part))
 
 
 def crossings_of_rows(
@@ -58,26 +59,30 @@ def crossings_of_rows(
 ) -> Crossings:
     """Return the crossings of segments (n, 3); none, and not valid, where a segment is not finite."""
     order, first, last = segments_in_order(starts, ends)
-    counts, begins = np.empty(len(order), dtype=np.int64), np.empty(len(order), dtype=np.bool_)
+    n = len(order)
+    counts, places, begins = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.bool_)
+    valid, offsets = np.empty(n, np.bool_), np.zeros(n + 1, np.int64)
 
-    def part(i: int, j: int) -> FloatArray:
-        found: list[FloatArray] = []
-        room = 4 * (j - i) + 64
-        while True:
-            t = np.empty(room)
-            done, used = cross_many(blob, first[i:j], last[i:j], resolution, tolerance, counts[i:j], begins[i:j], t)
-            found.append(t[:used])
-            i += done
-            if i == j:
-                return np.concatenate(found)
-            if done == 0:
-                room *= 4
+    def part(i: int, j: int) -> tuple[int, int, FloatArray]:
+        some = slice(i, j)
+        found = cross_many(
+            blob, first[some], last[some], False, resolution, tolerance, counts[some], begins[some], places[some]
+        )
+        valid[order[some]] = counts[some] >= 0
+        offsets[1:][order[some]] = np.maximum(counts[some], 0)
+        return i, j, found
 
-    found = np.concatenate(in_parts(len(order), 4_000, part)) if len(order) else np.empty(0)
-    valid, offsets = np.empty(len(order), dtype=np.bool_), np.zeros(len(order) + 1, dtype=np.int64)
-    valid[order] = counts >= 0
-    offsets[1:][order] = np.maximum(counts, 0)
+    parts = in_parts(n, 4_000, part)
     np.cumsum(offsets, out=offsets)
-    t, points, entering = np.empty(len(found)), np.empty((len(found), 3)), np.empty(len(found), dtype=np.bool_)
-    place_many(first, last, order, begins, found, offsets, t, points, entering)
+    m = int(offsets[-1])
+    t, points, entering = np.empty(m), np.empty((m, 3)), np.empty(m, np.bool_)
+
+    def place(k: int, stop: int) -> None:
+        for i, j, found in parts[k:stop]:
+            place_all(
+                first[i:j], last[i:j], order[i:j], counts[i:j], begins[i:j], places[i:j], found, offsets, t, points,
+                entering,
+            )  # fmt: skip
+
+    in_parts(len(parts), 1, place)
     return Crossings(offsets, t, points, entering, valid)

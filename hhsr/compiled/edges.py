@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from hhsr.compiled.records import Plane
-from hhsr.kernels.crossing import cross_many
+from hhsr.kernels.crossing_many import cross_many
 from hhsr.model import Cut, FloatArray
 
 EDGE_OFFSET = 1e-6  # mm, how far off a straight edge its four sides are asked
@@ -72,19 +72,19 @@ def _edge_pieces(
 ) -> list[FloatArray]:
     """Return the pieces (6,) of start → end about which the four quadrants between two planes do not all agree."""
     shifts = EDGE_OFFSET * np.array([n + m, n - m, m - n, -n - m])
-    counts, begins = np.empty(4, dtype=np.int64), np.empty(4, dtype=np.bool_)
-    t = np.empty(1024)
-    done, _ = cross_many(blob_view, start + shifts, end + shifts, EDGE_RESOLUTION, EDGE_RESOLUTION, counts, begins, t)
-    if done < 4:
-        return [np.concatenate([start, end])]
-    stops = np.concatenate([[0.0], np.sort(t[: counts.sum()]), [1.0]])
-    offsets = np.concatenate([[0], np.cumsum(counts)])
+    counts, places, begins = np.empty(4, np.int64), np.empty(4, np.int64), np.empty(4, np.bool_)
+    t = cross_many(
+        blob_view, start + shifts, end + shifts, False, EDGE_RESOLUTION, EDGE_RESOLUTION, counts, begins, places
+    )
+    stops = np.concatenate([[0.0], np.sort(t), [1.0]])
     pieces = []
     for a, b in pairwise(stops):
         if b <= a:
             continue
         x = 0.5 * (a + b)
-        states = {bool(begins[k]) ^ bool((t[offsets[k] : offsets[k + 1]] < x).sum() % 2) for k in range(4)}
+        states = {
+            bool(begins[k]) ^ bool((t[places[k] : places[k] + counts[k]] < x).sum() % 2) for k in range(4) if counts[k] >= 0
+        }
         if len(states) > 1:
             pieces.append(np.concatenate([start + a * (end - start), start + b * (end - start)]))
     return pieces

@@ -46,6 +46,7 @@ def voxel_grid(blob: FloatArray, low: FloatArray, side: float, counts: np.ndarra
     frame = np.array([*low, side, 1.0 / side])
     tables: list[np.ndarray] = [
         frame, leaps, slots, bases, by_octant, planes[:, :DETAIL], surfels[:, :DETAIL], surfels[:, DETAIL:],
+        np.zeros(16),  # strides read a row of each table, also where there is none
     ]  # fmt: skip
     places = np.concatenate([[0], np.cumsum([-(-table.nbytes // 8) for table in tables])]) + start + voxel_at.VOXEL_INTS
     record = np.zeros(voxel_at.VOXEL_INTS, dtype=np.int64)

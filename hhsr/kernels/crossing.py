@@ -9,21 +9,21 @@ import numpy as np
 from numba import njit
 
 from hhsr.kernels.clipped import follow_tree, merge_touches
+from hhsr.kernels.lane import BEGIN, COUNT, LANES, MERGE, ROWS, set_out
 from hhsr.kernels.layout import VOXELS, integers, tables
 from hhsr.kernels.segment import PIECES, emit
 from hhsr.kernels.tree import into_tree
 from hhsr.kernels.unmanaged import unmanaged
 from hhsr.kernels.voxels import solid_contains
-from hhsr.kernels.walk import follow_voxels
+from hhsr.kernels.walk import go_on
 
 SLOTS = 64  # pending tree nodes of one segment: three a level
-MERGE = 1e-9  # mm: a leaving and an entering closer than this are one touch
 
 
 @njit(cache=True, error_model="numpy")
 def scratch():
-    """Return (work, slots, pending): what one thread needs to follow segments."""
-    return np.empty((PIECES + 1, 8)), np.empty((SLOTS, 2)), np.empty(SLOTS, dtype=np.int64)
+    """Return (work, slots, pending): what one thread needs to follow segments; the lanes are work's last rows."""
+    return np.zeros((PIECES + 1 + ROWS, LANES)), np.empty((SLOTS, 2)), np.empty(SLOTS, dtype=np.int64)
 
 
 @unmanaged
@@ -42,10 +42,13 @@ def follow_segment(
         return solid_contains(blob, ints, tab, root, px, py, pz), np.int64(0)
     gap = MERGE / length
     if root == 0 and ints[VOXELS] != 0:
-        return follow_voxels(
-            blob, ints, tab, px, py, pz, ex, ey, ez, length, gap, resolution, tolerance, first, out, work, slots,
-            pending,
-        )  # fmt: skip
+        lanes = work[PIECES + 1 :]
+        if not set_out(blob, ints, lanes, 0, px, py, pz, ex, ey, ez, length):
+            return False, np.int64(0)
+        go_on(
+            blob, ints, tab, lanes, np.int64(0), resolution, tolerance, first, np.bool_(True), out, work, slots, pending
+        )
+        return lanes[BEGIN, 0] > 0.0, np.int64(lanes[COUNT, 0])
     begin = solid_contains(blob, ints, tab, root, px, py, pz)
     state, count, done = follow_tree(
         blob, ints, tab, root, px, py, pz, dx, dy, dz, 0.0, 1.0, gap, resolution, tolerance, first, begin, out,
@@ -55,50 +58,6 @@ def follow_segment(
         _, count = emit(state, solid_contains(blob, ints, tab, root, ex, ey, ez), 1.0, out, count)
         count = merge_touches(out, count, gap)
     return begin, count
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def cross_many(blob, starts, ends, resolution, tolerance, counts, begins, ts):
-    """Follow (n, 3) → (n, 3) LPS segments. counts: (n,) crossings of each, −1 not finite. begins: (n,) start inside.
-
-    ts: room for all t, one segment after another. Returns (segments done, slots used): the room may not suffice.
-    """
-    ints, tab = integers(blob), tables(blob)
-    work, slots, pending = scratch()
-    used = 0
-    for i in range(starts.shape[0]):
-        if not _finite(starts, ends, i):
-            counts[i], begins[i] = -1, False
-            continue
-        px, py, pz = into_tree(blob, ints, starts[i, 0], starts[i, 1], starts[i, 2])
-        ex, ey, ez = into_tree(blob, ints, ends[i, 0], ends[i, 1], ends[i, 2])
-        begins[i], count = follow_segment(
-            blob, ints, tab, np.int64(0), px, py, pz, ex, ey, ez, resolution, tolerance, np.bool_(False), ts[used:],
-            work, slots, pending,
-        )  # fmt: skip
-        if count > ts.shape[0] - used:
-            return i, used
-        counts[i] = count
-        used += count
-    return starts.shape[0], used
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def place_many(starts, ends, order, begins, found, offsets, t, points, entering):
-    """Fill t (m,), points (m, 3) and entering (m,) of the crossings that were found (m,) of segments (n, 3) → (n, 3).
-
-    order: (n,) the row of the answers that each segment is for; begins: (n,) whether it starts inside. offsets:
-    (n + 1,) where each row's crossings begin.
-    """
-    used = 0
-    for row in range(starts.shape[0]):
-        inside = begins[row]
-        for k in range(offsets[order[row]], offsets[order[row] + 1]):
-            inside = not inside
-            t[k], entering[k] = found[used], inside
-            for c in range(3):
-                points[k, c] = starts[row, c] + t[k] * (ends[row, c] - starts[row, c])
-            used += 1
 
 
 @njit(cache=True, error_model="numpy")
@@ -162,36 +121,3 @@ def first_exits(blob, root, centre, rays, resolution, tolerance, out):
             resolution, tolerance, np.bool_(True), t, work, slots, pending,
         )  # fmt: skip
         out[i] = (t[0] if count > 0 else 1.0) if inside else 0.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def first_many(blob, starts, ends, order, resolution, tolerance, out):
-    """Fill (n,) t of the first crossing of LPS segments (m, 3): NaN none, −1 not finite.
-
-    order: (m,) the row of the answers that each is for. Returns how many are not finite.
-    """
-    ints, tab = integers(blob), tables(blob)
-    work, slots, pending = scratch()
-    t = np.empty(64)
-    bad = 0
-    for i in range(starts.shape[0]):
-        if not _finite(starts, ends, i):
-            out[order[i]] = -1.0
-            bad += 1
-            continue
-        px, py, pz = into_tree(blob, ints, starts[i, 0], starts[i, 1], starts[i, 2])
-        ex, ey, ez = into_tree(blob, ints, ends[i, 0], ends[i, 1], ends[i, 2])
-        _, count = follow_segment(
-            blob, ints, tab, np.int64(0), px, py, pz, ex, ey, ez, resolution, tolerance, np.bool_(True), t, work,
-            slots, pending,
-        )  # fmt: skip
-        out[order[i]] = t[0] if count > 0 else np.nan
-    return bad
-
-
-@unmanaged
-def _finite(starts, ends, i):
-    for k in range(3):
-        if not (math.isfinite(starts[i, k]) and math.isfinite(ends[i, k])):
-            return False
-    return True

@@ -12,6 +12,10 @@ import numpy as np
 from hhsr.kernels.cell import leaf_implicit
 from hhsr.kernels.chart_walk import follow_cells
 from hhsr.kernels.clipped import follow_tree, merge_touches
+from hhsr.kernels.lane import (
+    BACK, BEGIN, BYTE_TABLE, COUNT, END, GAP, INVERSE, LAST, LEAP_TABLE, LEFT_AT, LENGTH, NUDGED, SHIFT, SIGN,
+    SPEED, START, STATE, STOP, SURE, T, U, V,
+)  # fmt: skip
 from hhsr.kernels.layout import (
     FRAME,
     NODE_FLOAT_SIZE,
@@ -20,7 +24,6 @@ from hhsr.kernels.layout import (
     OWNER_INTS,
     OWNER_RECORD,
     ROTATED,
-    VOXEL_FRAME,
     VOXELS,
 )
 from hhsr.kernels.segment import PIECES
@@ -33,18 +36,13 @@ from hhsr.kernels.voxels import (
     BRICK,
     BRICK_PLANES,
     BRICKS,
-    BYTES,
     DETAILS,
-    LEAPS,
     NO_SURFEL,
-    OCTANT_BYTES,
     OUT_BYTE,
     PLANES,
     solid_contains,
 )
 
-NUDGE = 1e-7  # mm (and voxels) past a voxel's border: less than voxels and planes are proven beyond theirs
-STILL = 1e-12  # voxels: along an axis, a segment that moves less stays where it is
 UNKNOWN = 2
 NONE, MONOTONE, OWN, CLIPPED = 0, 1, 2, 3  # kinds of runs: F is proven monotone; one leaf's; anybody's
 # A run, in the last row of the scratch: from which t, its owner, the sign of dF/dt, the least and greatest |dF/dt|,
@@ -52,7 +50,7 @@ NONE, MONOTONE, OWN, CLIPPED = 0, 1, 2, 3  # kinds of runs: F is proven monotone
 RUN, RUN_START, RUN_OWNER, RUN_SIGN, RUN_LEAST, RUN_MOST, RUN_BEND, RUN_GUESS = PIECES, 0, 1, 2, 3, 4, 5, 6
 
 
-@unmanaged
+@inlined
 def _close_run(
     blob, ints, tab, kind, px, py, pz, dx, dy, dz, length, end, new, resolution, tolerance, gap, state, out, count,
     work, slots, pending,
@@ -115,55 +113,35 @@ def _enter(kind, work, a, b, owner, slope, stray, bend, guess):
 
 
 @inlined
-def _clip(u, v, size, t0, t1):
-    """Return the interval of t in [t0, t1] in which u + t·v lies in [0, size]."""
-    if abs(v) < STILL:
-        return (t0, t1) if 0.0 <= u <= size else (1.0, 0.0)
-    a, b = -u / v, (size - u) / v
-    if a > b:
-        a, b = b, a
-    return max(t0, a), min(t1, b)
+def go_on(blob, ints, tab, lanes, lane, resolution, tolerance, first, alone, out, work, slots, pending):
+    """Go on with the walk in a lane; return whether it is at its end.
 
-
-@unmanaged
-def follow_voxels(
-    blob, ints, tab, px, py, pz, qx, qy, qz, length, gap, resolution, tolerance, first, out, work, slots, pending
-):
-    """Return (start state, count) of p → q (tree's frame): `hhsr.kernels.crossing.follow_segment`."""
-    dx, dy, dz = qx - px, qy - py, qz - pz
+    alone: to the end. Else to a voxel that may be left by strides of all lanes (`hhsr.kernels.stride`), no run being
+    pending. first: to the first crossing at most. out: (k,) t of each change of state.
+    """
     octets, words = blob.view(np.uint8), blob.view(np.int32)
-    c, f = ints[VOXELS], ints[VOXEL_FRAME]
+    c = ints[VOXELS]
     nx, ny, nz = ints[c], ints[c + 1], ints[c + 2]
-    bricks, bases, voxels = ints[c + BRICKS], ints[c + BASES], ints[c + BYTES]
+    top_x, top_y, top_z = BRICK * nx - 1, BRICK * ny - 1, BRICK * nz - 1
+    bricks, bases = ints[c + BRICKS], ints[c + BASES]
     brick_planes, planes, details = ints[c + BRICK_PLANES], ints[c + PLANES], ints[c + DETAILS]
-    scale = blob[f + 4]
-    # All in voxels from here on: u + t·v.
-    ux, uy, uz = (px - blob[f]) * scale, (py - blob[f + 1]) * scale, (pz - blob[f + 2]) * scale
-    vx, vy, vz = dx * scale, dy * scale, dz * scale
-    top_x, top_y, top_z = BRICK * nx, BRICK * ny, BRICK * nz
-    start, stop = _clip(ux, vx, float(top_x), 0.0, 1.0)
-    start, stop = _clip(uy, vy, float(top_y), start, stop)
-    start, stop = _clip(uz, vz, float(top_z), start, stop)
-    if not start < stop:
-        return False, np.int64(0)
-    # Along an axis the border at x is met at x·i + k; a still axis never is.
-    ix = 1.0 / vx if abs(vx) >= STILL else 0.0
-    iy = 1.0 / vy if abs(vy) >= STILL else 0.0
-    iz = 1.0 / vz if abs(vz) >= STILL else 0.0
-    kx = -ux * ix if abs(vx) >= STILL else np.inf
-    ky = -uy * iy if abs(vy) >= STILL else np.inf
-    kz = -uz * iz if abs(vz) >= STILL else np.inf
-    sx, sy, sz = (1 if vx >= 0.0 else -1), (1 if vy >= 0.0 else -1), (1 if vz >= 0.0 else -1)
-    ox, oy, oz = (1 - sx) >> 1, (1 - sy) >> 1, (1 - sz) >> 1
-    octant = (1 - ox) + 2 * (1 - oy) + 4 * (1 - oz)
-    leaps = ints[c + LEAPS] + octant * (nx * ny * nz)
-    voxels += octant * ints[c + OCTANT_BYTES]
-    nudge = max(NUDGE * min(1.0, blob[f + 3]) / length, 1e-15)
-    speed = math.sqrt(vx * vx + vy * vy + vz * vz)
-    t = start + nudge if start > 0.0 else 0.0
-    begin = state = False
-    begun, sure = start > 0.0, False  # whether the start's state is known; whether a whole voxel's stands up to the end
-    count, kind, closing, at, last = np.int64(0), np.int64(NONE), UNKNOWN, 0.0, -1
+    leaps, voxels = int(lanes[LEAP_TABLE, lane]), int(lanes[BYTE_TABLE, lane])
+    px, py, pz = lanes[START, lane], lanes[START + 1, lane], lanes[START + 2, lane]
+    qx, qy, qz = lanes[END, lane], lanes[END + 1, lane], lanes[END + 2, lane]
+    dx, dy, dz = qx - px, qy - py, qz - pz
+    ux, uy, uz = lanes[U, lane], lanes[U + 1, lane], lanes[U + 2, lane]
+    vx, vy, vz = lanes[V, lane], lanes[V + 1, lane], lanes[V + 2, lane]
+    ix, iy, iz = lanes[INVERSE, lane], lanes[INVERSE + 1, lane], lanes[INVERSE + 2, lane]
+    kx, ky, kz = lanes[SHIFT, lane], lanes[SHIFT + 1, lane], lanes[SHIFT + 2, lane]
+    sx, sy, sz = int(lanes[SIGN, lane]), int(lanes[SIGN + 1, lane]), int(lanes[SIGN + 2, lane])
+    ox, oy, oz = int(lanes[BACK, lane]), int(lanes[BACK + 1, lane]), int(lanes[BACK + 2, lane])
+    t, stop, nudge = lanes[T, lane], lanes[STOP, lane], lanes[NUDGED, lane]
+    length, gap, speed = lanes[LENGTH, lane], lanes[GAP, lane], lanes[SPEED, lane]
+    begun, begin, state = lanes[STATE, lane] >= 0.0, lanes[BEGIN, lane] > 0.0, lanes[STATE, lane] > 0.0
+    strode = t != lanes[LEFT_AT, lane]
+    sure, last = strode or lanes[SURE, lane] > 0.0, -1 if strode else int(lanes[LAST, lane])
+    done = True
+    count, kind, closing, at = int(lanes[COUNT, lane]), np.int64(NONE), UNKNOWN, 0.0
     while True:
         if closing != UNKNOWN:
             state, count = _close_run(
@@ -172,17 +150,17 @@ def follow_voxels(
             )  # fmt: skip
             kind, closing = np.int64(NONE), UNKNOWN
         if first and count > 0 and (t if kind == NONE else work[RUN, RUN_START]) > out[0] + gap:
-            return begin, count
+            break
         if t >= stop:
             # The end has its own state: along a cutting plane it may not be the one that the walk came with.
             holds = stop >= 1.0 and (state if sure else solid_contains(blob, ints, tab, np.int64(0), qx, qy, qz))
             if kind == NONE:
                 state, count = change(state, holds, stop, gap, out, count)
-                return begin, count
+                break
             closing, at = (1 if holds else 0), stop
             continue
         x, y, z = ux + t * vx, uy + t * vy, uz + t * vz
-        i, j, k = min(max(int(x), 0), top_x - 1), min(max(int(y), 0), top_y - 1), min(max(int(z), 0), top_z - 1)
+        i, j, k = min(max(int(x), 0), top_x), min(max(int(y), 0), top_y), min(max(int(z), 0), top_z)
         bi, bj, bk = i >> 2, j >> 2, k >> 2
         brick = (bi * ny + bj) * nz + bk
         leap = np.int64(octets[leaps + brick])
@@ -287,3 +265,10 @@ def follow_voxels(
             if after != UNKNOWN:
                 closing, at = after, max(a, b)
         t = max(end, t) + nudge
+        if not alone and kind == NONE and closing == UNKNOWN and t < stop and not (first and count > 0):
+            done = False
+            break
+    lanes[T, lane] = lanes[LEFT_AT, lane] = t
+    lanes[STATE, lane], lanes[BEGIN, lane] = 1.0 if state else 0.0, 1.0 if begin else 0.0
+    lanes[SURE, lane], lanes[COUNT, lane], lanes[LAST, lane] = 1.0 if sure else 0.0, count, last
+    return done

@@ -1,0 +1,161 @@
+"""Vectors of numbers in formulas, for kernels that a compiler finds none in: each operation emits one instruction.
+
+Used while numba compiles an intrinsic. A vector of LANES doubles, 32-bit integers or truths; a plain number in a formula
+stands for all lanes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+
+LANES = 8
+DOUBLE, FLOAT, LONG, INT = ir.DoubleType(), ir.FloatType(), ir.IntType(64), ir.IntType(32)
+
+
+def _wide(element: Any, lanes: int = LANES) -> Any:
+    return ir.VectorType(element, lanes)
+
+
+class Vector:
+    """LANES values while code is emitted by a builder of LLVM's."""
+
+    def __init__(self, builder: Any, value: Any) -> None:
+        self.builder, self.value = builder, value
+        self.floats = isinstance(value.type.element, (ir.DoubleType, ir.FloatType))
+
+    @classmethod
+    def of(cls, builder: Any, element: Any) -> Vector:
+        """Return one value of the emitted code in all lanes."""
+        none = ir.Constant(_wide(element.type), ir.Undefined)
+        first = builder.insert_element(none, element, ir.Constant(INT, 0))
+        return cls(builder, builder.shuffle_vector(first, none, ir.Constant(_wide(INT), [0] * LANES)))
+
+    def _right(self, other: Vector | float) -> Any:
+        return other.value if isinstance(other, Vector) else ir.Constant(self.value.type, [other] * LANES)
+
+    def _emit(self, name: str, other: Vector | float) -> Vector:
+        return Vector(self.builder, getattr(self.builder, name)(self.value, self._right(other)))
+
+    def __add__(self, other: Vector | float) -> Vector:
+        return self._emit("fadd" if self.floats else "add", other)
+
+    def __sub__(self, other: Vector | float) -> Vector:
+        return self._emit("fsub" if self.floats else "sub", other)
+
+    def __mul__(self, other: Vector | float) -> Vector:
+        return self._emit("fmul" if self.floats else "mul", other)
+
+    def __truediv__(self, other: Vector | float) -> Vector:
+        return self._emit("fdiv", other)
+
+    def __and__(self, other: Vector | int) -> Vector:
+        return self._emit("and_", other)
+
+    def __or__(self, other: Vector | int) -> Vector:
+        return self._emit("or_", other)
+
+    def __xor__(self, other: Vector | int) -> Vector:
+        return self._emit("xor", other)
+
+    def __lshift__(self, bits: Vector | int) -> Vector:
+        return self._emit("shl", bits)
+
+    def __rshift__(self, bits: Vector | int) -> Vector:
+        return self._emit("lshr", bits)
+
+    def __invert__(self) -> Vector:
+        """Return the other truth."""
+        return Vector(self.builder, self.builder.not_(self.value))
+
+    def __abs__(self) -> Vector:
+        """Return the sizes of doubles."""
+        bits = self.builder.bitcast(self.value, _wide(LONG))
+        bits = self.builder.and_(bits, ir.Constant(_wide(LONG), [0x7FFFFFFFFFFFFFFF] * LANES))
+        return Vector(self.builder, self.builder.bitcast(bits, self.value.type))
+
+    def _compare(self, sign: str, other: Vector | float) -> Vector:
+        compare = self.builder.fcmp_ordered if self.floats else self.builder.icmp_signed
+        return Vector(self.builder, compare(sign, self.value, self._right(other)))
+
+    def __lt__(self, other: Vector | float) -> Vector:
+        return self._compare("<", other)
+
+    def __gt__(self, other: Vector | float) -> Vector:
+        return self._compare(">", other)
+
+    def is_(self, other: Vector | float) -> Vector:
+        """Return where two are equal; false where one is not a number."""
+        return self._compare("==", other)
+
+    def where(self, yes: Vector, no: Vector | float) -> Vector:
+        """Return, of truths, `yes` in the lanes that are true and `no` in the others."""
+        return Vector(self.builder, self.builder.select(self.value, yes.value, yes._right(no)))
+
+    def least(self, other: Vector | float) -> Vector:
+        return (self < other).where(self, other)
+
+    def most(self, other: Vector | float) -> Vector:
+        return (self > other).where(self, other)
+
+    def doubles(self) -> Vector:
+        """Return integers, floats or truths (0 and 1) as doubles."""
+        kind = _wide(DOUBLE)
+        if self.floats:
+            return Vector(self.builder, self.builder.fpext(self.value, kind))
+        truths = self.value.type.element.width == 1
+        return Vector(self.builder, (self.builder.uitofp if truths else self.builder.sitofp)(self.value, kind))
+
+    def integers(self) -> Vector:
+        """Return doubles as integers, towards 0."""
+        return Vector(self.builder, self.builder.fptosi(self.value, _wide(INT)))
+
+    def bits(self) -> Any:
+        """Return truths as one 64-bit integer, lane 0 the lowest bit."""
+        packed = self.builder.bitcast(self.value, ir.IntType(LANES))
+        return self.builder.zext(packed, LONG)
+
+
+def load(builder: Any, table: Any, first: int) -> Vector:
+    """Return LANES numbers in a row from a number of elements on."""
+    at = builder.gep(table, [ir.Constant(LONG, first)])
+    return Vector(builder, builder.load(builder.bitcast(at, _wide(table.type.pointee).as_pointer()), align=8))
+
+
+def store(builder: Any, vector: Vector, table: Any, first: int) -> None:
+    """Put LANES numbers into a table from a number of elements on."""
+    at = builder.gep(table, [ir.Constant(LONG, first)])
+    builder.store(vector.value, builder.bitcast(at, vector.value.type.as_pointer()), align=8)
+
+
+def _lane(builder: Any, table: Any, index: Vector, k: int) -> Any:
+    """Return where lane k's element of a table lies."""
+    place = builder.extract_element(index.value, ir.Constant(INT, k))
+    return builder.gep(table, [builder.sext(place, LONG)])
+
+
+def gather(builder: Any, table: Any, index: Vector) -> Vector:
+    """Return the table's element at each lane's index."""
+    value = ir.Constant(_wide(table.type.pointee), ir.Undefined)
+    for k in range(LANES):
+        value = builder.insert_element(value, builder.load(_lane(builder, table, index, k)), ir.Constant(INT, k))
+    return Vector(builder, value)
+
+
+def gather_four(builder: Any, table: Any, index: Vector) -> list[Vector]:
+    """Return the four floats from each lane's index on, as four vectors of doubles."""
+    four = _wide(FLOAT, 4).as_pointer()
+    rows = [
+        builder.load(builder.bitcast(_lane(builder, table, index, k), four), align=4) for k in range(LANES)
+    ]
+    size = 4
+    while len(rows) > 1:
+        size *= 2
+        both = ir.Constant(_wide(INT, size), list(range(size)))
+        rows = [builder.shuffle_vector(rows[k], rows[k + 1], both) for k in range(0, len(rows), 2)]
+    columns = ([4 * k + c for k in range(LANES)] for c in range(4))
+    return [
+        Vector(builder, builder.shuffle_vector(rows[0], rows[0], ir.Constant(_wide(INT), column))).doubles()
+        for column in columns
+    ]
