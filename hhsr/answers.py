@@ -64,12 +64,12 @@ def crossings_of_one(
     What the tuple holds is cut from four arrays that one call fills: half of a single call's time would go into more.
     """
     offsets, t = np.empty(2, dtype=np.int64), np.empty(ROOM)
-    points, entering = np.empty((ROOM, 3)), np.empty(ROOM + 1, dtype=np.bool_)
+    points, entering = np.empty((ROOM, 3)), np.empty(ROOM + 2, dtype=np.bool_)
     (ax, ay, az), (bx, by, bz) = start.tolist(), end.tolist()
     count = cross_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance, offsets, t, points, entering)
     if count < 0:
         return None
-    return Crossings(offsets, t[:count], points[:count], entering[:count], entering[ROOM:])
+    return Crossings(offsets, t[:count], points[:count], entering[:count], entering[ROOM : ROOM + 1])
 
 
 def curve(points: ArrayLike) -> FloatArray:

@@ -65,9 +65,8 @@ def neighbours_first(points: FloatArray) -> NDArray[np.int64]:
     return order
 
 
-def segments_in_order(starts: FloatArray, ends: FloatArray) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
-    """Return (order, starts, ends) of segments (n, 3) in the order of `neighbours_first` of their middles."""
+def by_middles(starts: FloatArray, ends: FloatArray) -> NDArray[np.int64]:
+    """Return an order of segments (n, 3) → (n, 3): that of `neighbours_first` of their middles."""
     if len(starts) < FEW:
-        return np.arange(len(starts)), starts, ends
-    order = neighbours_first(starts + ends)  # twice the middles: the order is the same
-    return order, np.take(starts, order, axis=0), np.take(ends, order, axis=0)
+        return np.arange(len(starts))
+    return neighbours_first(starts + ends)  # twice the middles: the order is the same

@@ -11,8 +11,8 @@ from itertools import pairwise
 import numpy as np
 
 from hhsr.compiled.records import Plane
-from hhsr.kernels.crossing_many import cross_many
 from hhsr.model import Cut, FloatArray
+from hhsr.segments import cross_segments
 
 EDGE_OFFSET = 1e-6  # mm, how far off a straight edge its four sides are asked
 EDGE_RESOLUTION = 1e-4  # mm
@@ -73,7 +73,7 @@ def _edge_pieces(
     """Return the pieces (6,) of start → end about which the four quadrants between two planes do not all agree."""
     shifts = EDGE_OFFSET * np.array([n + m, n - m, m - n, -n - m])
     counts, places, begins = np.empty(4, np.int64), np.empty(4, np.int64), np.empty(4, np.bool_)
-    t = cross_many(
+    t = cross_segments(
         blob_view, start + shifts, end + shifts, False, EDGE_RESOLUTION, EDGE_RESOLUTION, counts, begins, places
     )
     stops = np.concatenate([[0.0], np.sort(t), [1.0]])
@@ -83,7 +83,9 @@ def _edge_pieces(
             continue
         x = 0.5 * (a + b)
         states = {
-            bool(begins[k]) ^ bool((t[places[k] : places[k] + counts[k]] < x).sum() % 2) for k in range(4) if counts[k] >= 0
+            bool(begins[k]) ^ bool((t[places[k] : places[k] + counts[k]] < x).sum() % 2)
+            for k in range(4)
+            if counts[k] >= 0
         }
         if len(states) > 1:
             pieces.append(np.concatenate([start + a * (end - start), start + b * (end - start)]))

@@ -39,20 +39,20 @@ def voxel_grid(blob: FloatArray, low: FloatArray, side: float, counts: np.ndarra
     leaps = np.empty((8, *states.shape), dtype=np.int8)
     for octant in range(8):
         voxel_at.fill_octant(states, octant, leaps[octant])
-    by_octant = _with_leaps(states, octets)
+    steps = _steps(states, octets)
     slots = np.where(states > 0, voxel_at.INSIDE_BRICK, voxel_at.OUTSIDE_BRICK).astype(np.int32)
     slots[states == 0] = np.arange(len(mixed))
     start = len(blob)
     frame = np.array([*low, side, 1.0 / side])
     tables: list[np.ndarray] = [
-        frame, leaps, slots, bases, by_octant, planes[:, :DETAIL], surfels[:, :DETAIL], surfels[:, DETAIL:],
+        frame, leaps, slots, bases, octets, planes[:, :DETAIL], surfels[:, :DETAIL], surfels[:, DETAIL:], steps,
         np.zeros(16),  # strides read a row of each table, also where there is none
     ]  # fmt: skip
     places = np.concatenate([[0], np.cumsum([-(-table.nbytes // 8) for table in tables])]) + start + voxel_at.VOXEL_INTS
     record = np.zeros(voxel_at.VOXEL_INTS, dtype=np.int64)
-    record[:3], record[voxel_at.OCTANT_BYTES] = counts, octets.size
+    record[:3], record[voxel_at.OCTANT_WORDS] = counts, steps[0].size
     record[voxel_at.LEAPS], record[voxel_at.BYTES] = 8 * places[1], 8 * places[4]
-    record[voxel_at.BRICKS], record[voxel_at.BASES] = 2 * places[2], 2 * places[3]
+    record[[voxel_at.BRICKS, voxel_at.BASES, voxel_at.STEPS]] = 2 * places[[2, 3, 8]]
     grown = joined([blob, record, *tables])
     head = grown.view(np.int64)[: at.HEADER_SIZE]
     record = grown.view(np.int64)[start : start + voxel_at.VOXEL_INTS]
@@ -61,17 +61,17 @@ def voxel_grid(blob: FloatArray, low: FloatArray, side: float, counts: np.ndarra
     return grown
 
 
-def _with_leaps(bricks: np.ndarray, octets: np.ndarray) -> np.ndarray:
-    """Return the bytes (8, n, 64) of the bricks with voxels, with each octant's leaps in them."""
+def _steps(bricks: np.ndarray, octets: np.ndarray) -> np.ndarray:
+    """Return the leaps (8, n, STEP_WORDS), packed, of the voxels of the bricks with bytes (n, 64), by octant."""
     states = np.empty(tuple(voxel_at.BRICK * n for n in bricks.shape), dtype=np.int8)
     voxel_at.state_voxels(bricks, octets, states)
-    out = np.empty((8, *octets.shape), dtype=np.uint8)
+    out = np.empty((8, len(octets), voxel_at.STEP_WORDS), dtype=np.uint32)
 
     def fill(i: int, j: int) -> None:
         for octant in range(i, j):
             leaps = np.empty_like(states)
             voxel_at.fill_octant(states, octant, leaps)
-            voxel_at.fill_bytes(bricks, leaps, octets, out[octant])
+            voxel_at.fill_steps(bricks, leaps, out[octant])
 
     in_parts(8, 1, fill)
     return out

@@ -9,11 +9,12 @@ import numpy as np
 from numba import njit
 
 from hhsr.kernels.clipped import follow_tree, merge_touches
-from hhsr.kernels.lane import BEGIN, COUNT, LANES, MERGE, ROWS, set_out
+from hhsr.kernels.lane import BEGIN, COUNT, MERGE, ROWS, set_out
 from hhsr.kernels.layout import VOXELS, integers, tables
 from hhsr.kernels.segment import PIECES, emit
 from hhsr.kernels.tree import into_tree
 from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.vectors import LANES
 from hhsr.kernels.voxels import solid_contains
 from hhsr.kernels.walk import go_on
 
@@ -64,7 +65,8 @@ def follow_segment(
 def cross_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance, offsets, t, points, entering):
     """Follow one LPS segment; return how many crossings it has, −1 where not finite or more than t (k,) holds.
 
-    Fills offsets (2,), t, points (k, 3), entering (k + 1,), the last of it true: all that `Crossings` holds.
+    Fills offsets (2,), t, points (k, 3), entering (k + 2,), the last but one true: all that `Crossings` holds; and the
+    last: whether it starts inside.
     """
     ints, tab = integers(blob), tables(blob)
     if not math.isfinite(ax + ay + az + bx + by + bz):
@@ -79,7 +81,7 @@ def cross_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance, offsets, t, p
     if count > t.shape[0]:
         return -1
     offsets[0], offsets[1] = 0, count
-    entering[t.shape[0]] = True
+    entering[t.shape[0]], entering[t.shape[0] + 1] = True, inside
     for k in range(count):
         inside = not inside
         entering[k] = inside

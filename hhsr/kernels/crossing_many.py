@@ -9,19 +9,21 @@ import math
 import numpy as np
 from numba import njit
 
-from hhsr.kernels.crossing import follow_segment, scratch
-from hhsr.kernels.lane import BEGIN, COUNT, LANES, LEFT_AT, SEGMENT, STATE, STOP, T, set_out
+from hhsr.kernels.crossing import scratch
+from hhsr.kernels.lane import BEGIN, COUNT, GAP, LEFT_AT, SEGMENT, STATE, STOP, T, set_out
 from hhsr.kernels.layout import VOXELS, integers, tables
 from hhsr.kernels.segment import PIECES
 from hhsr.kernels.stride import stride
 from hhsr.kernels.tree import into_tree
 from hhsr.kernels.unmanaged import inlined, unmanaged
-from hhsr.kernels.voxels import BASES, BRICK_PLANES, BRICKS, PLANES, solid_contains
-from hhsr.kernels.walk import go_on
+from hhsr.kernels.vectors import LANES, bits_set
+from hhsr.kernels.voxels import BASES, BRICK_PLANES, BRICKS, BYTES, DETAILS, PLANES, solid_contains
+from hhsr.kernels.walk import cross_voxel, go_on
 
 WAITING = 3  # so many lanes are without a stride when the others wait for them
-ROOM = 64  # crossings of one segment; one with more is followed once more, alone
-NOT_FINITE, MANY = -1, -2  # instead of a count: a segment that is not finite; one to be followed alone
+ROOM = 64  # crossings of one segment
+# Instead of a count: a segment that is not finite; one that has no room here, or of a solid without a grid.
+NOT_FINITE, MANY = -1, -2
 ROW, USED, LIVE = 0, 1, 2
 
 
@@ -36,7 +38,7 @@ def _next_segment(blob, ints, tab, lanes, lane, starts, ends, row, counts, begin
         row += 1
         counts[i], begins[i] = 0, False
         ax, ay, az, bx, by, bz = starts[i, 0], starts[i, 1], starts[i, 2], ends[i, 0], ends[i, 1], ends[i, 2]
-        if not math.isfinite(ax + ay + az + bx + by + bz):
+        if (ax - ax) + (ay - ay) + (az - az) + (bx - bx) + (by - by) + (bz - bz) != 0.0:
             counts[i] = NOT_FINITE
             continue
         px, py, pz = into_tree(blob, ints, ax, ay, az)
@@ -61,23 +63,6 @@ def _strode_to_end(lanes, lane):
     return t >= stop and t != lanes[LEFT_AT, lane] and (stop >= 1.0 or lanes[STATE, lane] == 0.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _alone(blob, start, end, first, resolution, tolerance, room):
-    """Return (starts inside, crossings (k,)) of one LPS segment that needs more room."""
-    ints, tab = integers(blob), tables(blob)
-    work, slots, pending = scratch()
-    px, py, pz = into_tree(blob, ints, start[0], start[1], start[2])
-    ex, ey, ez = into_tree(blob, ints, end[0], end[1], end[2])
-    while True:
-        t = np.empty(room)
-        inside, count = follow_segment(
-            blob, ints, tab, np.int64(0), px, py, pz, ex, ey, ez, resolution, tolerance, first, t, work, slots, pending
-        )
-        if count <= room:
-            return inside, t[:count]
-        room = count
-
-
 @unmanaged
 def _side_by_side(
     blob, ints, tab, starts, ends, first, resolution, tolerance, counts, begins, places, ts, found, begun, work, slots,
@@ -85,13 +70,14 @@ def _side_by_side(
 ):  # fmt: skip
     """Follow segments in the lanes until all are done; or return False where ts has no room for one more's crossings.
 
-    begun: (3,) the row of the next segment, slots of ts used, and lanes under way, all 0 to begin with; it may be called
-    again to go on. found: (LANES, ROOM) scratch.
+    begun: (3,) the row of the next segment, slots of ts used, lanes under way; all 0 to begin with, and as they were
+    left to go on. found: (LANES, ROOM) scratch.
     """
     c = ints[VOXELS]
     lanes, words = work[PIECES + 1 :], blob.view(np.int32)
     nx, ny, nz, bricks, bases = ints[c], ints[c + 1], ints[c + 2], ints[c + BRICKS], ints[c + BASES]
-    brick_planes, planes = ints[c + BRICK_PLANES], ints[c + PLANES]
+    octets = ints[c + BYTES]
+    brick_planes, planes, details = ints[c + BRICK_PLANES], ints[c + PLANES], ints[c + DETAILS]
     row, used, live = begun[ROW], begun[USED], begun[LIVE]
     if row == 0:
         for lane in range(LANES):
@@ -102,17 +88,18 @@ def _side_by_side(
             begun[ROW], begun[USED], begun[LIVE] = row, used, live
             return False
         while True:
-            taken = stride(lanes, words, tab, nx, ny, nz, bricks, bases, brick_planes, planes)
-            going = (taken & 0x55) + ((taken >> 1) & 0x55)
-            going = (going & 0x33) + ((going >> 2) & 0x33)
-            going = (going & 0x0F) + (going >> 4)
+            taken = stride(lanes, words, tab, nx, ny, nz, bricks, bases, octets, brick_planes, planes, details)
+            going = bits_set(taken)
             if going == 0 or going <= live - WAITING:
                 break
         for lane in range(LANES):
             i = np.int64(lanes[SEGMENT, lane])
             if (taken >> lane) & 1 or i < 0:
                 continue
-            if not _strode_to_end(lanes, lane) and not go_on(
+            if cross_voxel(blob, ints, tab, lanes, np.int64(lane), tolerance, found[lane]):
+                if not (first and lanes[COUNT, lane] > 0.0 and lanes[T, lane] > found[lane, 0] + lanes[GAP, lane]):
+                    continue
+            elif not _strode_to_end(lanes, lane) and not go_on(
                 blob, ints, tab, lanes, np.int64(lane), resolution, tolerance, first, np.bool_(False), found[lane],
                 work, slots, pending,
             ):  # fmt: skip
@@ -142,8 +129,8 @@ def _longer(ts):
 def cross_many(blob, starts, ends, first, resolution, tolerance, counts, begins, places):
     """Return (m,) t of the crossings of LPS segments (n, 3) → (n, 3), each segment's in order.
 
-    first: of the first crossing of each, at most. counts: (n,) crossings of each, −1 not finite. begins: (n,) whether
-    it starts inside. places: (n,) where its crossings begin among all, if there are any.
+    first: of the first crossing of each, at most. counts: (n,) crossings of each, NOT_FINITE, or MANY: to be followed
+    alone. begins: (n,) whether it starts inside. places: (n,) where its crossings begin among all, if there are any.
     """
     ints, tab = integers(blob), tables(blob)
     work, slots, pending = scratch()
@@ -154,16 +141,7 @@ def cross_many(blob, starts, ends, first, resolution, tolerance, counts, begins,
         slots, pending,
     ):  # fmt: skip
         ts = _longer(ts)
-    ts, used = ts, begun[USED]
-    for i in range(starts.shape[0]):
-        if counts[i] == MANY:
-            begins[i], more = _alone(blob, starts[i], ends[i], first, resolution, tolerance, 4 * ROOM)
-            while used + len(more) > ts.shape[0]:
-                ts = _longer(ts)
-            ts[used : used + len(more)] = more
-            counts[i], places[i] = len(more), used
-            used += len(more)
-    return ts[:used]
+    return ts[: begun[USED]]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -180,8 +158,15 @@ def place_first(order, counts, places, ts, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def place_counts(order, counts, valid, out):
+    """Put counts (k,), 0 where a segment is not finite, into rows `order` of out, and which are finite into valid."""
+    for i in range(order.shape[0]):
+        valid[order[i]], out[order[i]] = counts[i] >= 0, max(counts[i], 0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def place_all(starts, ends, order, counts, begins, places, ts, offsets, t, points, entering):
-    """Fill t (m,), points (m, 3) and entering (m,) with the crossings of segments (n, 3) → (n, 3) that `cross_many` found.
+    """Fill t (m,), points (m, 3) and entering (m,) with what `cross_many` found of segments (n, 3) → (n, 3).
 
     order: (n,) the row of the answers that each segment is for. offsets: where each row's crossings begin.
     """

@@ -10,18 +10,21 @@ import numpy as np
 
 from hhsr.kernels.layout import VOXEL_FRAME, VOXELS
 from hhsr.kernels.unmanaged import inlined, unmanaged
-from hhsr.kernels.vectors import LANES
-from hhsr.kernels.voxels import BRICK, BYTES, LEAPS, OCTANT_BYTES
+from hhsr.kernels.voxels import BRICK, LEAPS, OCTANT_WORDS, STEPS
 
 # u, v; along an axis the border at x is met at t = x·inverse + shift, a still axis never; the sign of v, and 1 where it
-# is negative; t, where it stops, how far past a border it goes on; the state it is in; where the octant's tables begin.
+# is negative; t, where it stops, how far past a border it goes on; the state it is in, −1 where that is not known yet;
+# where the octant's tables begin.
 U, V, INVERSE, SHIFT, SIGN, BACK = 0, 3, 6, 9, 12, 15
-T, STOP, NUDGED, STATE, LEAP_TABLE, BYTE_TABLE = 18, 19, 20, 21, 22, 23
-# Tree's frame, mm: start, end; the length; MERGE of it. |v|. The start's state, and whether that is known yet; whether a
-# proven voxel's state stands up to t; crossings so far; the owner of the last voxel, where a cut passed it, else −1; the
-# t that it was left at; the number of the segment, −1 of an empty lane.
+T, STOP, NUDGED, STATE, LEAP_TABLE, STEP_TABLE = 18, 19, 20, 21, 22, 23
+# Tree's frame, mm: start, end; the length; MERGE of it. |v|. The start's state; whether a proven voxel's state stands
+# up to t; crossings so far; the owner of the last voxel, where a cut passed it, else −1; the t it was left at; the
+# number of the segment, −1 of an empty lane.
 START, END, LENGTH, GAP, SPEED = 24, 27, 30, 31, 32
-BEGIN, SURE, COUNT, LAST, LEFT_AT, SEGMENT, ROWS = 33, 34, 35, 36, 37, 38, 39
+BEGIN, SURE, COUNT, LAST, LEFT_AT, SEGMENT = 33, 34, 35, 36, 37, 38
+# Of the voxel that the last stride did not take, where its plane leaves the state open: number of the surfel (else −1),
+# the plane's value at t and change by t, and where the segment leaves the voxel.
+SURFEL, DEPTH, SLOPE, EXIT, ROWS = 39, 40, 41, 42, 43
 
 MERGE = 1e-9  # mm: a leaving and an entering closer than this are one touch
 NUDGE = 1e-7  # mm (and voxels) past a voxel's border: less than voxels and planes are proven beyond theirs
@@ -29,24 +32,19 @@ STILL = 1e-12  # voxels: along an axis, a segment that moves less stays where it
 
 
 @inlined
-def _clip(u, v, size, t0, t1):
-    """Return the interval of t in [t0, t1] in which u + t·v lies in [0, size]."""
-    if abs(v) < STILL:
-        return (t0, t1) if 0.0 <= u <= size else (1.0, 0.0)
-    a, b = -u / v, (size - u) / v
-    if a > b:
-        a, b = b, a
-    return max(t0, a), min(t1, b)
-
-
-@inlined
-def _set_axis(lanes, lane, axis, u, v):
-    """Fill in one axis of a walk."""
+def _set_axis(lanes, lane, axis, u, v, size, t0, t1):
+    """Fill in one axis of a walk; return the interval of t in [t0, t1] in which u + t·v lies in [0, size]."""
     lanes[U + axis, lane], lanes[V + axis, lane] = u, v
-    still = abs(v) < STILL
-    inverse = 0.0 if still else 1.0 / v
-    lanes[INVERSE + axis, lane], lanes[SHIFT + axis, lane] = inverse, np.inf if still else -u * inverse
-    lanes[SIGN + axis, lane], lanes[BACK + axis, lane] = (1.0, 0.0) if v >= 0.0 else (-1.0, 1.0)
+    forward = v >= 0.0
+    lanes[SIGN + axis, lane], lanes[BACK + axis, lane] = (1.0, 0.0) if forward else (-1.0, 1.0)
+    if abs(v) < STILL:
+        lanes[INVERSE + axis, lane], lanes[SHIFT + axis, lane] = 0.0, np.inf
+        return (t0, t1) if 0.0 <= u <= size else (1.0, 0.0)
+    inverse = 1.0 / v
+    shift = -u * inverse
+    lanes[INVERSE + axis, lane], lanes[SHIFT + axis, lane] = inverse, shift
+    far = (size - u) * inverse
+    return (max(t0, shift), min(t1, far)) if forward else (max(t0, far), min(t1, shift))
 
 
 @unmanaged
@@ -58,25 +56,23 @@ def set_out(blob, ints, lanes, lane, px, py, pz, qx, qy, qz, length):
     scale = blob[f + 4]
     ux, uy, uz = (px - blob[f]) * scale, (py - blob[f + 1]) * scale, (pz - blob[f + 2]) * scale
     vx, vy, vz = dx * scale, dy * scale, dz * scale
-    start, stop = _clip(ux, vx, float(BRICK * nx), 0.0, 1.0)
-    start, stop = _clip(uy, vy, float(BRICK * ny), start, stop)
-    start, stop = _clip(uz, vz, float(BRICK * nz), start, stop)
+    start, stop = _set_axis(lanes, lane, 0, ux, vx, float(BRICK * nx), 0.0, 1.0)
+    start, stop = _set_axis(lanes, lane, 1, uy, vy, float(BRICK * ny), start, stop)
+    start, stop = _set_axis(lanes, lane, 2, uz, vz, float(BRICK * nz), start, stop)
     if not start < stop:
         return False
-    _set_axis(lanes, lane, 0, ux, vx)
-    _set_axis(lanes, lane, 1, uy, vy)
-    _set_axis(lanes, lane, 2, uz, vz)
     octant = (1 if vx >= 0.0 else 0) + (2 if vy >= 0.0 else 0) + (4 if vz >= 0.0 else 0)
-    nudge = max(NUDGE * min(1.0, blob[f + 3]) / length, 1e-15)
+    once = 1.0 / length
+    nudge = max(NUDGE * min(1.0, blob[f + 3]) * once, 1e-15)
     t = start + nudge if start > 0.0 else 0.0
     lanes[T, lane], lanes[STOP, lane], lanes[NUDGED, lane] = t, stop, nudge
     begun = start > 0.0  # from outside of the grid
     lanes[STATE, lane], lanes[BEGIN, lane] = 0.0 if begun else -1.0, 0.0
     lanes[LEAP_TABLE, lane] = ints[c + LEAPS] + octant * (nx * ny * nz)
-    lanes[BYTE_TABLE, lane] = ints[c + BYTES] + octant * ints[c + OCTANT_BYTES]
+    lanes[STEP_TABLE, lane] = ints[c + STEPS] + octant * ints[c + OCTANT_WORDS]
     lanes[START, lane], lanes[START + 1, lane], lanes[START + 2, lane] = px, py, pz
     lanes[END, lane], lanes[END + 1, lane], lanes[END + 2, lane] = qx, qy, qz
-    lanes[LENGTH, lane], lanes[GAP, lane] = length, MERGE / length
+    lanes[LENGTH, lane], lanes[GAP, lane] = length, MERGE * once
     lanes[SPEED, lane] = math.sqrt(vx * vx + vy * vy + vz * vz)
     lanes[SURE, lane], lanes[COUNT, lane], lanes[LAST, lane], lanes[LEFT_AT, lane] = 0.0, 0.0, -1.0, t
     return True

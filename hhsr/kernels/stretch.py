@@ -62,7 +62,7 @@ def excess_along(blob, ints, leaf, x, y, z, dx, dy, dz):
     return f - 1.0, ((cx * x * dx + cy * y * dy + cz * z * dz) / norm + f * ds) * d
 
 
-@inlined
+@unmanaged
 def root_in(blob, ints, leaf, px, py, pz, dx, dy, dz, lo, hi, guess, rises, least, most, bend, tolerance):
     """Return t in [lo, hi] where F = 1 on p + t·d (leaf's frame), to the tolerance (of t).
 

@@ -11,28 +11,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
 from hhsr.kernels.lane import (
     BACK,
     BEGIN,
-    BYTE_TABLE,
+    DEPTH,
+    EXIT,
     INVERSE,
-    LANES,
     LEAP_TABLE,
     NUDGED,
     SHIFT,
     SIGN,
+    SLOPE,
     STATE,
+    STEP_TABLE,
     STOP,
+    SURFEL,
     T,
     U,
     V,
 )
-from hhsr.kernels.vectors import INT, Vector, gather, gather_four, load, store
-from hhsr.kernels.voxels import NO_SURFEL, OUT_BYTE
+from hhsr.kernels.vectors import INT, LANES, Vector, fetch_ahead, gather, gather_four, load, power_of_two, store
+from hhsr.kernels.voxels import FARTHEST_STEP, NO_SURFEL, OUT_BYTE, STEP_BITS, STEP_WORDS
 
 
 def _byte(builder: Any, words: Any, index: Vector) -> Vector:
@@ -44,13 +46,13 @@ def _linear(normal: Sequence[Vector], place: Sequence[Vector]) -> Vector:
     return normal[0] * place[0] + normal[1] * place[1] + normal[2] * place[2]
 
 
-def _emit(builder: Any, lanes: Any, words: Any, tab: Any, grid: Sequence[Any]) -> Any:
+def emit_stride(builder: Any, lanes: Any, words: Any, tab: Any, grid: Sequence[Any]) -> Any:
     """Emit a stride; return a bit for each lane that took it."""
 
     def row(number: int) -> Vector:
         return load(builder, lanes, number * LANES)
 
-    nx, ny, nz, bricks, bases, brick_planes, planes = (
+    nx, ny, nz, bricks, bases, octets, brick_planes, planes, details = (
         Vector.of(builder, builder.trunc(number, INT)) for number in grid
     )
     t, stop, state = row(T), row(STOP), row(STATE)
@@ -69,19 +71,15 @@ def _emit(builder: Any, lanes: Any, words: Any, tab: Any, grid: Sequence[Any]) -
     far = ~leaps & (abs(level) > 1.0)
     near = t + (abs(level) - 1.0) / abs(slope)
     nears = far & ((level > 0.0) ^ (slope > 0.0))
-    byte = _byte(
-        builder,
-        words,
-        row(BYTE_TABLE).integers() + (slot << 6) + (((voxel[0] & 3) << 4) | ((voxel[1] & 3) << 2) | (voxel[2] & 3)),
-    )
+    inner = ((voxel[0] & 3) << 4) | ((voxel[1] & 3) << 2) | (voxel[2] & 3)
+    byte = _byte(builder, words, octets + (slot << 6) + inner)
+    step = gather(builder, words, row(STEP_TABLE).integers() + (slot * STEP_WORDS) + (inner >> 4))
+    step = (step >> ((inner & 15) * STEP_BITS)) & FARTHEST_STEP
     whole = leaps | far
     proven, byte_in = ~whole & (byte > NO_SURFEL), byte < OUT_BYTE
     surfel = ~whole & (byte < NO_SURFEL)
     number = gather(builder, words, bases + slot) + surfel.where(byte, 0)
-    reach = leaps.where(
-        leaps_in.where(leap, (leap ^ 255) + 1),
-        proven.where(byte_in.where(byte - NO_SURFEL, byte - (OUT_BYTE - 1)), 1),
-    ).doubles()
+    reach = leaps.where(leaps_in.where(leap, (leap ^ 255) + 1), power_of_two(proven.where(step, 0))).doubles()
     end = nears.where(near, float("inf")).least(stop)
     for k in (2, 1, 0):
         border = whole.where(voxel[k] >> 2, voxel[k]).doubles() + row(SIGN + k) * reach + row(BACK + k)
@@ -89,8 +87,15 @@ def _emit(builder: Any, lanes: Any, words: Any, tab: Any, grid: Sequence[Any]) -
         end = (border * row(INVERSE + k) + row(SHIFT + k)).least(end)
     *normal, offset = gather_four(builder, tab, planes + (number << 2))
     depth = _linear(normal, [place[k] - voxel[k].doubles() - 0.5 for k in range(3)]) + offset
-    left = depth + _linear(normal, way) * (end - t)
+    slope = _linear(normal, way)
+    left = depth + slope * (end - t)
     above, below = (depth > 1.0) & (left > 1.0), (depth < -1.0) & (left < -1.0)
+    # What the plane leaves open is looked at next: `hhsr.kernels.walk.cross_voxel`. NaN: a cut passes.
+    left_open = surfel & ~(above | below) & (t < stop)
+    fetch_ahead(builder, tab, left_open.where(details, planes) + (number << 2))
+    store(builder, (left_open & depth.is_(depth)).where(number.doubles(), -1.0), lanes, SURFEL * LANES)
+    for number_of, value in ((DEPTH, depth), (SLOPE, slope), (EXIT, end)):
+        store(builder, value, lanes, number_of * LANES)
     settled = whole | proven | (surfel & (above | below))
     inside = leaps.where(leaps_in, far.where(level < 0.0, proven.where(byte_in, below)))
     # What the start's voxel proves is the state to begin with.
@@ -102,22 +107,22 @@ def _emit(builder: Any, lanes: Any, words: Any, tab: Any, grid: Sequence[Any]) -
     return taken.bits()
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def stride(
     typing: Any, lanes: Any, words: Any, tab: Any, nx: Any, ny: Any, nz: Any, bricks: Any, bases: Any,
-    brick_planes: Any, planes: Any,
+    octets: Any, brick_planes: Any, planes: Any, details: Any,
 ) -> Any:  # fmt: skip
     """Take a stride in each lane (`hhsr.kernels.lane`) that has one, and return their bits.
 
     words, tab: the blob as 32-bit integers, and its float32 tables; then what the grid's record says.
     """
-    signature = types.int64(lanes, words, tab, nx, ny, nz, bricks, bases, brick_planes, planes)
+    signature = types.int64(lanes, words, tab, nx, ny, nz, bricks, bases, octets, brick_planes, planes, details)
 
     def emit(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
-        pointers = [
+        lanes, words, tab = (
             context.make_array(kind)(context, builder, value).data
             for kind, value in zip(signature.args[:3], arguments[:3], strict=True)
-        ]
-        return _emit(builder, *pointers, arguments[3:])
+        )
+        return emit_stride(builder, lanes, words, tab, arguments[3:])
 
     return signature, emit

@@ -1,7 +1,7 @@
 """Vectors of numbers in formulas, for kernels that a compiler finds none in: each operation emits one instruction.
 
-Used while numba compiles an intrinsic. A vector of LANES doubles, 32-bit integers or truths; a plain number in a formula
-stands for all lanes.
+Used while numba compiles an intrinsic. A vector of LANES doubles, 32-bit integers or truths; a plain number in a
+formula stands for all lanes.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 LANES = 8
 DOUBLE, FLOAT, LONG, INT = ir.DoubleType(), ir.FloatType(), ir.IntType(64), ir.IntType(32)
@@ -117,6 +119,11 @@ class Vector:
         return self.builder.zext(packed, LONG)
 
 
+def power_of_two(bits: Vector) -> Vector:
+    """Return 2^bits of integers."""
+    return Vector(bits.builder, bits.builder.shl(bits._right(1), bits.value))
+
+
 def load(builder: Any, table: Any, first: int) -> Vector:
     """Return LANES numbers in a row from a number of elements on."""
     at = builder.gep(table, [ir.Constant(LONG, first)])
@@ -146,9 +153,7 @@ def gather(builder: Any, table: Any, index: Vector) -> Vector:
 def gather_four(builder: Any, table: Any, index: Vector) -> list[Vector]:
     """Return the four floats from each lane's index on, as four vectors of doubles."""
     four = _wide(FLOAT, 4).as_pointer()
-    rows = [
-        builder.load(builder.bitcast(_lane(builder, table, index, k), four), align=4) for k in range(LANES)
-    ]
+    rows = [builder.load(builder.bitcast(_lane(builder, table, index, k), four), align=4) for k in range(LANES)]
     size = 4
     while len(rows) > 1:
         size *= 2
@@ -159,3 +164,19 @@ def gather_four(builder: Any, table: Any, index: Vector) -> list[Vector]:
         Vector(builder, builder.shuffle_vector(rows[0], rows[0], ir.Constant(_wide(INT), column))).doubles()
         for column in columns
     ]
+
+
+def fetch_ahead(builder: Any, table: Any, index: Vector) -> None:
+    """Ask for the table's elements at each lane's index, to be near when they are read: no read waits for them."""
+    name, byte = "llvm.prefetch.p0", ir.IntType(8).as_pointer()
+    kind = ir.FunctionType(ir.VoidType(), [byte, INT, INT, INT])
+    function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
+    for k in range(LANES):
+        at = builder.bitcast(_lane(builder, table, index, k), byte)
+        builder.call(function, [at, ir.Constant(INT, 0), ir.Constant(INT, 3), ir.Constant(INT, 1)])
+
+
+@intrinsic
+def bits_set(typing: Any, number: Any) -> Any:
+    """Return how many bits of a number are set."""
+    return types.int64(types.int64), lambda context, builder, signature, arguments: builder.ctpop(arguments[0])

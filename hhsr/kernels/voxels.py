@@ -2,8 +2,8 @@
 
 Voxels come in bricks of 4³. A brick that is proven whole has a leap for each octant of directions: the greatest cube of
 bricks, from it on that way, in which nothing changes. The others have a plane (`hhsr.kernels.surfel`) that decides most
-of the brick, and each of their voxels a byte: the number of its own surfel in the brick; or that it is proven, and for
-each octant of directions the greatest cube of voxels, from it on that way, in which nothing changes.
+of the brick, and each of their voxels a byte: the number of its own surfel in the brick; or that it is proven. Proven
+voxels have, for each octant of directions, a leap too: a cube of voxels, from it on that way, in which nothing changes.
 """
 
 import math
@@ -33,14 +33,13 @@ COARSE = 8  # bricks a side of the first cubes that are tried
 NODES = 256
 # The grid's record, integer slots: bricks along x, y, z; then where its tables begin: octants' leaps (bytes), bricks
 # (32 bits: the number of a brick with voxels; −1 inside, −2 outside), of bricks with voxels the first surfel (32 bits),
-# the 64 bytes (of the first octant; OCTANT_BYTES on, of the next), and the brick's own plane (float32 slot); of surfels
-# the planes and the details (float32 slots).
-LEAPS, BRICKS, BASES, BYTES, BRICK_PLANES, PLANES, DETAILS, OCTANT_BYTES, VOXEL_INTS = 3, 4, 5, 6, 7, 8, 9, 10, 11
+# the 64 bytes, the brick's own plane (float32 slot); of surfels the planes and the details (float32 slots); of bricks
+# with voxels the leaps of these (STEP_WORDS of 32 bits; those of the next octant OCTANT_WORDS on).
+LEAPS, BRICKS, BASES, BYTES, BRICK_PLANES, PLANES, DETAILS, STEPS, OCTANT_WORDS = 3, 4, 5, 6, 7, 8, 9, 10, 11
+VOXEL_INTS = 12
 INSIDE_BRICK, OUTSIDE_BRICK = -1, -2
-# A byte: 0 … 63 a surfel of the brick, NO_SURFEL, from IN_BYTE on inside with a leap of 1 and more, from OUT_BYTE on
-# outside.
-NO_SURFEL, IN_BYTE, OUT_BYTE = 64, 65, 160
-FARTHEST = OUT_BYTE - IN_BYTE  # voxels a leap
+NO_SURFEL, IN_BYTE, OUT_BYTE = 64, 65, 66  # a byte: 0 … 63 a surfel of the brick; none; proven inside; outside
+STEP_WORDS, STEP_BITS, FARTHEST_STEP = 4, 2, 3  # a voxel's leap: 2^bits voxels
 LONGEST = 127  # bricks
 
 
@@ -199,20 +198,26 @@ def state_voxels(bricks, octets, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_bytes(bricks, leaps, octets, out):
-    """Fill out (n, 64) bytes with the leaps (4·nx, 4·ny, 4·nz) int8 of one octant; the rest as `state_voxels`."""
+def fill_steps(bricks, leaps, out):
+    """Fill out (n, STEP_WORDS) uint32 with the leaps (4·nx, 4·ny, 4·nz) int8 of one octant; bricks: `state_voxels`."""
     slot = 0
     for bi in range(bricks.shape[0]):
         for bj in range(bricks.shape[1]):
             for bk in range(bricks.shape[2]):
                 if bricks[bi, bj, bk] != 0:
                     continue
-                for v in range(64):
-                    byte = np.int64(octets[slot, v])
-                    leap = np.int64(leaps[BRICK * bi + (v >> 4), BRICK * bj + ((v >> 2) & 3), BRICK * bk + (v & 3)])
-                    if byte > NO_SURFEL:
-                        byte += min(abs(leap), FARTHEST) - 1
-                    out[slot, v] = byte
+                for w in range(STEP_WORDS):
+                    word = np.uint32(0)
+                    for k in range(16):
+                        v = 16 * w + k
+                        leap = abs(
+                            np.int64(leaps[BRICK * bi + (v >> 4), BRICK * bj + ((v >> 2) & 3), BRICK * bk + (v & 3)])
+                        )
+                        step = 0
+                        while step < FARTHEST_STEP and leap >= 2 << step:
+                            step += 1
+                        word |= np.uint32(step) << np.uint32(STEP_BITS * k)
+                    out[slot, w] = word
                 slot += 1
 
 

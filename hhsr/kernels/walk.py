@@ -13,8 +13,32 @@ from hhsr.kernels.cell import leaf_implicit
 from hhsr.kernels.chart_walk import follow_cells
 from hhsr.kernels.clipped import follow_tree, merge_touches
 from hhsr.kernels.lane import (
-    BACK, BEGIN, BYTE_TABLE, COUNT, END, GAP, INVERSE, LAST, LEAP_TABLE, LEFT_AT, LENGTH, NUDGED, SHIFT, SIGN,
-    SPEED, START, STATE, STOP, SURE, T, U, V,
+    BACK,
+    BEGIN,
+    COUNT,
+    DEPTH,
+    END,
+    EXIT,
+    GAP,
+    INVERSE,
+    LAST,
+    LEAP_TABLE,
+    LEFT_AT,
+    LENGTH,
+    NUDGED,
+    SHIFT,
+    SIGN,
+    SLOPE,
+    SPEED,
+    START,
+    STATE,
+    STEP_TABLE,
+    STOP,
+    SURE,
+    SURFEL,
+    T,
+    U,
+    V,
 )  # fmt: skip
 from hhsr.kernels.layout import (
     FRAME,
@@ -36,10 +60,14 @@ from hhsr.kernels.voxels import (
     BRICK,
     BRICK_PLANES,
     BRICKS,
+    BYTES,
     DETAILS,
+    FARTHEST_STEP,
     NO_SURFEL,
     OUT_BYTE,
     PLANES,
+    STEP_BITS,
+    STEP_WORDS,
     solid_contains,
 )
 
@@ -48,6 +76,17 @@ NONE, MONOTONE, OWN, CLIPPED = 0, 1, 2, 3  # kinds of runs: F is proven monotone
 # A run, in the last row of the scratch: from which t, its owner, the sign of dF/dt, the least and greatest |dF/dt|,
 # |d²F/dt²|, and where F is about 1.
 RUN, RUN_START, RUN_OWNER, RUN_SIGN, RUN_LEAST, RUN_MOST, RUN_BEND, RUN_GUESS = PIECES, 0, 1, 2, 3, 4, 5, 6
+
+
+@inlined
+def _cross_leaf(
+    blob, ints, leaf, px, py, pz, dx, dy, dz, begin, end, guess, rises, least, most, bend, tolerance
+):  # fmt: skip
+    """Return where p + t·d (tree's frame) crosses a leaf's surface: `hhsr.kernels.stretch.root_in`."""
+    px, py, pz = into_leaf(blob, ints, leaf, px, py, pz)
+    if ints[leaf + ROTATED] != 0:
+        dx, dy, dz = turn_into_leaf(blob, ints[leaf + FRAME], dx, dy, dz)
+    return root_in(blob, ints, leaf, px, py, pz, dx, dy, dz, begin, end, guess, rises, least, most, bend, tolerance)
 
 
 @inlined
@@ -67,15 +106,15 @@ def _close_run(
         state, count = change(state, new, end, gap, out, count)
         return state, merge_touches(out, count, gap)
     leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * int(work[RUN, RUN_OWNER]) + OWNER_RECORD]
-    px, py, pz = into_leaf(blob, ints, leaf, px, py, pz)
-    if ints[leaf + ROTATED] != 0:
-        dx, dy, dz = turn_into_leaf(blob, ints[leaf + FRAME], dx, dy, dz)
     if kind == MONOTONE:
-        end = root_in(
+        end = _cross_leaf(
             blob, ints, leaf, px, py, pz, dx, dy, dz, begin, end, work[RUN, RUN_GUESS], work[RUN, RUN_SIGN] > 0.0,
             work[RUN, RUN_LEAST], work[RUN, RUN_MOST], work[RUN, RUN_BEND], tolerance / length,
         )  # fmt: skip
     else:
+        px, py, pz = into_leaf(blob, ints, leaf, px, py, pz)
+        if ints[leaf + ROTATED] != 0:
+            dx, dy, dz = turn_into_leaf(blob, ints[leaf + FRAME], dx, dy, dz)
         state, count = follow_cells(
             blob, ints, tab, leaf, px, py, pz, dx, dy, dz, length, begin, end, resolution, tolerance, gap, state, out,
             count, work,
@@ -125,7 +164,7 @@ def go_on(blob, ints, tab, lanes, lane, resolution, tolerance, first, alone, out
     top_x, top_y, top_z = BRICK * nx - 1, BRICK * ny - 1, BRICK * nz - 1
     bricks, bases = ints[c + BRICKS], ints[c + BASES]
     brick_planes, planes, details = ints[c + BRICK_PLANES], ints[c + PLANES], ints[c + DETAILS]
-    leaps, voxels = int(lanes[LEAP_TABLE, lane]), int(lanes[BYTE_TABLE, lane])
+    leaps, steps, voxels = int(lanes[LEAP_TABLE, lane]), int(lanes[STEP_TABLE, lane]), ints[c + BYTES]
     px, py, pz = lanes[START, lane], lanes[START + 1, lane], lanes[START + 2, lane]
     qx, qy, qz = lanes[END, lane], lanes[END + 1, lane], lanes[END + 2, lane]
     dx, dy, dz = qx - px, qy - py, qz - pz
@@ -186,11 +225,13 @@ def go_on(blob, ints, tab, lanes, lane, resolution, tolerance, first, alone, out
                 ey = ((bj + sy + oy) << 2) * iy + ky
                 ez = ((bk + sz + oz) << 2) * iz + kz
             else:
-                byte = np.int64(octets[voxels + 64 * slot + (((i & 3) << 4) | ((j & 3) << 2) | (k & 3))])
+                inner = ((i & 3) << 4) | ((j & 3) << 2) | (k & 3)
+                byte = np.int64(octets[voxels + 64 * slot + inner])
                 r = np.int64(1)
                 if byte > NO_SURFEL:
                     known = 1 if byte < OUT_BYTE else 0
-                    r = byte - (NO_SURFEL if byte < OUT_BYTE else OUT_BYTE - 1)
+                    step = np.int64(words[steps + STEP_WORDS * slot + (inner >> 4)]) >> (STEP_BITS * (inner & 15))
+                    r <<= step & FARTHEST_STEP
                 elif byte < NO_SURFEL:
                     surfel = np.int64(words[bases + slot]) + byte
                 ex = (i + sx * r + ox) * ix + kx
@@ -272,3 +313,45 @@ def go_on(blob, ints, tab, lanes, lane, resolution, tolerance, first, alone, out
     lanes[STATE, lane], lanes[BEGIN, lane] = 1.0 if state else 0.0, 1.0 if begin else 0.0
     lanes[SURE, lane], lanes[COUNT, lane], lanes[LAST, lane] = 1.0 if sure else 0.0, count, last
     return done
+
+
+@inlined
+def cross_voxel(blob, ints, tab, lanes, lane, tolerance, out):
+    """Take a lane through the voxel where its stride ended if its surfel settles that; return whether it did.
+
+    What `go_on` does most often: no run is pending, the plane proves the state behind the voxel and F monotone in it.
+    """
+    surfel, state = int(lanes[SURFEL, lane]), lanes[STATE, lane] > 0.0
+    if surfel < 0 or lanes[STATE, lane] < 0.0:
+        return False
+    t, end, l0, slope = lanes[T, lane], lanes[EXIT, lane], lanes[DEPTH, lane], lanes[SLOPE, lane]
+    l1 = l0 + slope * (end - t)
+    sure = abs(l0) > 1.0
+    if abs(l1) <= 1.0 or (sure and (l0 < 0.0) != state):
+        return False
+    o = ints[ints[VOXELS] + DETAILS] + DETAIL_SIZE * surfel
+    speed, thick = lanes[SPEED, lane], np.float64(tab[o + THICK])
+    stray = speed * np.float64(tab[o + TURN])
+    if abs(slope * thick) <= stray:
+        return False
+    if (l1 < 0.0) != state:
+        count = int(lanes[COUNT, lane])
+        if count >= out.shape[0]:
+            return False
+        a = t + (abs(l0) - 1.0) / abs(slope) if sure else t
+        b = max(a, end - (abs(l1) - 1.0) / abs(slope))
+        guess = t - l0 / slope
+        slope *= thick
+        px, py, pz = lanes[START, lane], lanes[START + 1, lane], lanes[START + 2, lane]
+        leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * int(tab[o + SURFEL_OWNER]) + OWNER_RECORD]
+        root = _cross_leaf(
+            blob, ints, leaf, px, py, pz, lanes[END, lane] - px, lanes[END + 1, lane] - py, lanes[END + 2, lane] - pz,
+            a, b, guess, slope > 0.0, abs(slope) - stray, abs(slope) + stray, speed * speed * np.float64(tab[o + BEND]),
+            tolerance / lanes[LENGTH, lane],
+        )  # fmt: skip
+        state, count = change(state, not state, root, lanes[GAP, lane], out, count)
+        lanes[STATE, lane], lanes[COUNT, lane] = 1.0 if state else 0.0, count
+    t = max(end, t) + lanes[NUDGED, lane]
+    lanes[T, lane] = lanes[LEFT_AT, lane] = t
+    lanes[SURE, lane], lanes[LAST, lane] = 1.0 if sure else 0.0, -1.0
+    return True

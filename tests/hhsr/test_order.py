@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hhsr.batches import FEW, neighbours_first, segments_in_order
+from hhsr.batches import FEW, by_middles, neighbours_first
 from hhsr.compiled import compile_tree
 from hhsr.kernels import layout as at
 from hhsr.kernels.descent import onto_surface
@@ -84,10 +84,7 @@ def test_segments_in_order_keep_their_rows(shape: Shape) -> None:
     starts, ends = rng.uniform(low - 20, high + 20, (2, FEW + 500, 3))
     starts[7], ends[11, 2], starts[FEW] = np.nan, np.inf, [0, -np.inf, 0]
     ends[13] = starts[13]
-    order, first, last = segments_in_order(starts, ends)
-    assert sorted(order) == list(range(len(starts)))
-    assert np.array_equal(first, starts[order], equal_nan=True)
-    assert np.array_equal(last, ends[order], equal_nan=True)
+    assert sorted(by_middles(starts, ends)) == list(range(len(starts)))
     found = shape.crossings(starts, ends, on_invalid="mark")
     t, valid = shape.first_crossing(starts, ends, on_invalid="mark")
     near = shape.closest_approach(starts, ends, 1.0, on_invalid="mark")

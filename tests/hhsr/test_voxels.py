@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from hhsr.kernels import layout as at
 from hhsr.kernels import voxels as grid_at
-from hhsr.kernels.crossing import cross_many, first_many
 from hhsr.kernels.stretch import excess, excess_along
 from hhsr.kernels.surfel import BEND, DETAIL_SIZE, EXTRA, OFFSET, PLANE_SIZE, SURFEL_OWNER, THICK, TURN
 from hhsr.kernels.tree import into_leaf, turn_into_leaf
 from hhsr.model import FloatArray, rotation_matrix
+from hhsr.segments import cross_segments
 from hhsr.shape import Shape
 from tests.hhsr.test_crossings import hard_segments
 from tests.strategies import random_tree
@@ -108,26 +108,25 @@ def test_a_plane_holds_all_over_its_voxel(depth: int, seed: int) -> None:
 def test_nothing_changes_in_the_cube_of_a_leap(depth: int, seed: int) -> None:
     grid = Grid(Shape(random_tree(seed, depth)))
     mixed = np.argwhere(grid.slots >= 0)
-    stride = int(grid.record[grid_at.OCTANT_BYTES])
-    assert stride == 64 * len(mixed)
-    first = grid.octets[:stride].astype(int).reshape(-1, 4, 4, 4)
+    first = grid.octets[: 64 * len(mixed)].astype(int).reshape(-1, 4, 4, 4)
     states = np.where(first < grid_at.IN_BYTE, 0, np.where(first < grid_at.OUT_BYTE, 1, -1))
+    packed, stride = grid.words[int(grid.record[grid_at.STEPS]) :], int(grid.record[grid_at.OCTANT_WORDS])
+    assert stride == grid_at.STEP_WORDS * len(mixed)
     whole = np.where(grid.slots == grid_at.INSIDE_BRICK, 1, -1).repeat(4, 0).repeat(4, 1).repeat(4, 2)
     for brick in mixed:
         i, j, k = 4 * brick
         whole[i : i + 4, j : j + 4, k : k + 4] = states[grid.slots[tuple(brick)]]
     longest = 0
     for octant in range(8):
-        octets = grid.octets[octant * stride :][:stride].astype(int).reshape(-1, 4, 4, 4)
-        assert np.array_equal(octets < grid_at.IN_BYTE, first < grid_at.IN_BYTE)
+        words = packed[octant * stride :][:stride].reshape(-1, grid_at.STEP_WORDS, 1)
+        steps = (words >> (grid_at.STEP_BITS * np.arange(16)) & grid_at.FARTHEST_STEP).reshape(-1, 4, 4, 4)
         ways = [1 if octant >> axis & 1 else -1 for axis in range(3)]
         for brick in mixed[:: max(1, len(mixed) // 60)]:
             for place in np.ndindex(4, 4, 4):
-                byte = octets[(grid.slots[tuple(brick)], *place)]
-                if byte < grid_at.IN_BYTE:
+                state = states[(grid.slots[tuple(brick)], *place)]
+                if state == 0:
                     continue
-                state = 1 if byte < grid_at.OUT_BYTE else -1
-                leap = byte - (grid_at.IN_BYTE if state > 0 else grid_at.OUT_BYTE) + 1
+                leap = 1 << steps[(grid.slots[tuple(brick)], *place)]
                 at_voxel = 4 * brick + place
                 cube = whole[
                     tuple(
@@ -166,13 +165,15 @@ def without_grid(blob: np.ndarray) -> np.ndarray:
     return copy
 
 
-def follow(blob: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def follow(
+    blob: np.ndarray, starts: np.ndarray, ends: np.ndarray, first: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (counts, whether segments begin inside, t)."""
-    counts, begins = np.empty(len(starts), dtype=np.int64), np.empty(len(starts), dtype=np.bool_)
-    t = np.empty(64 * len(starts) + 64)
-    done, used = cross_many(blob, starts, ends, 0.01, 0.001, counts, begins, t)
-    assert done == len(starts)
-    return counts, begins, t[:used]
+    counts, places, begins = (np.empty(len(starts), dtype=kind) for kind in (np.int64, np.int64, np.bool_))
+    t = cross_segments(blob, starts, ends, first, 0.01, 0.001, counts, begins, places)
+    assert len(t) == np.maximum(counts, 0).sum()
+    found = [t[place : place + count] for place, count in zip(places, counts, strict=True) if count > 0]
+    return counts, begins, np.concatenate([*found, np.empty(0)])
 
 
 def compare(shape: Shape, starts: np.ndarray, ends: np.ndarray, in_planes: int = 0) -> None:
@@ -196,11 +197,10 @@ def compare(shape: Shape, starts: np.ndarray, ends: np.ndarray, in_planes: int =
             both = np.sort(np.concatenate([own, twin]))
             different += bool(np.diff(both).min() * length[i] > 0.0101)
     assert different <= in_planes
-    first = np.empty(len(starts))
-    first_many(shape.compiled.blob, starts, ends, np.arange(len(starts)), 0.01, 0.001, first)
     has = counts > 0
-    assert np.array_equal(np.isnan(first), ~has)
-    assert np.array_equal(first[has], t[offset[has]])
+    first_counts, _, first = follow(shape.compiled.blob, starts, ends, True)
+    assert np.array_equal(first_counts, has.astype(np.int64))
+    assert np.array_equal(first, t[offset[has]])
 
 
 @pytest.mark.parametrize(("depth", "bands", "parts"), KINDS)
