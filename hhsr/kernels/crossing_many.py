@@ -27,7 +27,7 @@ NOT_FINITE, MANY = -1, -2
 ROW, USED, LIVE = 0, 1, 2
 
 
-@unmanaged
+@inlined
 def _next_segment(blob, ints, tab, lanes, lane, starts, ends, row, counts, begins):
     """Give a lane the next segment, from a row on, that meets the grid; return the row after it.
 

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from hhsr.kernels.layout import VOXEL_FRAME, VOXELS
-from hhsr.kernels.unmanaged import inlined, unmanaged
+from hhsr.kernels.unmanaged import inlined
 from hhsr.kernels.voxels import BRICK, LEAPS, OCTANT_WORDS, STEPS
 
 # u, v; along an axis the border at x is met at t = x·inverse + shift, a still axis never; the sign of v, and 1 where it
@@ -47,7 +47,7 @@ def _set_axis(lanes, lane, axis, u, v, size, t0, t1):
     return (max(t0, shift), min(t1, far)) if forward else (max(t0, far), min(t1, shift))
 
 
-@unmanaged
+@inlined
 def set_out(blob, ints, lanes, lane, px, py, pz, qx, qy, qz, length):
     """Begin the walk p → q (tree's frame; |q − p| > 0) in a lane; return whether it meets the grid at all."""
     dx, dy, dz = qx - px, qy - py, qz - pz
