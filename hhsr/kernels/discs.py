@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from hhsr.kernels.facets import RADIUS, THICK
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import inlined, unmanaged
 
 DISC_SIZE = 8
 WIDE = 16
@@ -107,7 +107,7 @@ _SHORT, _LONG, _NONE, _ALL = np.float32(1.0 - 1e-6), np.float32(1.0 + 1e-6), np.
 _TINY, _BLUR = np.float32(1e-30), np.float32(4e-6)  # mm²; what float32 leaves of a squared cosine, and more
 
 
-@unmanaged
+@inlined
 def bound_to_point(blocks, i, x, y, z, loose, most, bounds):
     """Fill bounds (16,) float32 with lower bounds of the squared distances of a point to the discs of a block.
 
@@ -127,7 +127,7 @@ def bound_to_point(blocks, i, x, y, z, loose, most, bounds):
     return mask
 
 
-@unmanaged
+@inlined
 def bound_to_segment(blocks, i, x, y, z, dx, dy, dz, loose, most, bounds):
     """Do as `bound_to_point` for p + t·d: by the slab about a disc's plane, and by the plane across the shortest way.
 

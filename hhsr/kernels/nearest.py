@@ -46,7 +46,7 @@ from hhsr.kernels.patch import (
 from hhsr.kernels.seeds import seed_at
 from hhsr.kernels.settle import settle_cell
 from hhsr.kernels.tree import turn_out_of_leaf
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import inlined, unmanaged
 
 VAST = 1e9  # mm
 ROUNDING = 1e-9  # of the coordinates
@@ -54,7 +54,7 @@ PATIENCE = 16  # facets that may wait
 SAMPLES = 4  # points of a segment that ask for a seed
 
 
-@unmanaged
+@inlined
 def _settle(blob, ints, tab, code, search, local, corners, spare, rects):
     """Offer the nearest point of a facet, or prove that it holds none: by quadratics where no cut touches it."""
     owner = ints[OWNER_INTS] + OWNER_INT_SIZE * (code >> 24)
@@ -141,45 +141,43 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
     depth, waiting = 1, 0
     nodes[0], keys[0] = (ints[levels] - 1) << 40, 0.0
     mask = np.int64(0)
-    while depth > 0:
+    while depth > 0 or waiting > 0:
         depth -= 1
-        if limit < 0.0 or keys[depth] > limit * limit:
-            continue
-        level, i = nodes[depth] >> 40, nodes[depth] & 0xFFFFFFFFFF
-        start, size = ints[levels + 1 + 2 * level], ints[levels + 2 + 2 * level]
-        if not reach < VAST:  # beyond what float32 holds: no disc is ruled out
-            bounds[:] = np.float32(0.0)
-            mask = np.int64((1 << WIDE) - 1)
-        elif moving:
-            mask = np.int64(bound_to_segment(blocks, start + i, x, y, z, dx, dy, dz, loose, limit * limit, bounds))
-        else:
-            mask = np.int64(bound_to_point(blocks, start + i, x, y, z, loose, limit * limit, bounds))
-        base = depth
-        while mask != 0:
-            c, mask = lowest_bit(mask)
-            if WIDE * i + c >= size:
-                continue
-            low = np.float64(bounds[c])
-            if level == 0:
-                keys[LATE + waiting], nodes[LATE + waiting] = low, ints[codes + WIDE * i + c]
-                waiting += 1
-                continue
-            # Inserted so that the nearest is next.
-            k = depth
-            while k > base and keys[k - 1] < low:
-                keys[k], nodes[k] = keys[k - 1], nodes[k - 1]
-                k -= 1
-            keys[k], nodes[k] = low, ((level - 1) << 40) + WIDE * i + c
-            depth += 1
+        if depth >= 0 and limit >= 0.0 and keys[depth] <= limit * limit:
+            level, i = nodes[depth] >> 40, nodes[depth] & 0xFFFFFFFFFF
+            start, size = ints[levels + 1 + 2 * level], ints[levels + 2 + 2 * level]
+            if not reach < VAST:  # beyond what float32 holds: no disc is ruled out
+                bounds[:] = np.float32(0.0)
+                mask = np.int64((1 << WIDE) - 1)
+            elif moving:
+                mask = np.int64(bound_to_segment(blocks, start + i, x, y, z, dx, dy, dz, loose, limit * limit, bounds))
+            else:
+                mask = np.int64(bound_to_point(blocks, start + i, x, y, z, loose, limit * limit, bounds))
+            base = depth
+            while mask != 0:
+                c, mask = lowest_bit(mask)
+                if WIDE * i + c >= size:
+                    continue
+                low = np.float64(bounds[c])
+                if level == 0:
+                    keys[LATE + waiting], nodes[LATE + waiting] = low, ints[codes + WIDE * i + c]
+                    waiting += 1
+                    continue
+                # Inserted so that the nearest is next.
+                k = depth
+                while k > base and keys[k - 1] < low:
+                    keys[k], nodes[k] = keys[k - 1], nodes[k - 1]
+                    k -= 1
+                keys[k], nodes[k] = low, ((level - 1) << 40) + WIDE * i + c
+                depth += 1
+        depth = max(depth, 0)
         # Facets wait: most are settled when the search is over, against a tight bound.
-        while waiting > PATIENCE:  # the bound is not tight yet
+        while waiting > (PATIENCE if depth > 0 else 0):
             waiting = _settle_nearest(blob, ints, tab, waiting, search, local, nodes, keys, corners, spare, rects)
             limit = search[BEST] - search[TOLERANCE]
-    while waiting > 0:
-        waiting = _settle_nearest(blob, ints, tab, waiting, search, local, nodes, keys, corners, spare, rects)
 
 
-@unmanaged
+@inlined
 def _settle_nearest(blob, ints, tab, waiting, search, local, nodes, keys, corners, spare, rects):
     """Settle the nearest of the facets that wait, from slot LATE on; return how many wait then."""
     last = LATE + waiting - 1

@@ -21,7 +21,7 @@ from hhsr.kernels.maps import (
 )
 from hhsr.kernels.polygon import clip_polygon, polygon_to_segment
 from hhsr.kernels.tree import into_leaf, turn_into_leaf
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import inlined, unmanaged
 
 # Slots of a search: start 3, vector 3, squared length; best distance, t, point 3 (owner's frame); tolerance; and where
 # the best point is the table's, its spot: owner (−1: it is exact), face, a, b; the exact one along that ray is no
@@ -46,7 +46,7 @@ def distance_to(search, x, y, z):
     return math.sqrt(rx * rx + ry * ry + rz * rz), t
 
 
-@unmanaged
+@inlined
 def into_own_frame(blob, ints, leaf, search, local):
     """Write the search's segment into `local`, in a leaf's frame."""
     local[START], local[START + 1], local[START + 2] = into_leaf(

@@ -14,7 +14,7 @@ from hhsr.kernels.layout import KINK, THIRD
 from hhsr.kernels.maps import jet_of, outside_region
 from hhsr.kernels.patch import BEST, FINEST, NODE_ROOM, TOLERANCE, distance_to, offer
 from hhsr.kernels.quadratic import square_is_clear
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import inlined, unmanaged
 
 WIDEST = 1e60  # mm: no surface lies beyond, and its fourth power is still a number
 ASIDE = 0.02  # tolerances: how far from a cut a point is offered that would lie beyond it
@@ -66,7 +66,7 @@ def _is_clear(
     )  # fmt: skip
 
 
-@unmanaged
+@inlined
 def settle_cell(blob, ints, tab, leaf, planes, count, search, face, o, a, b, half, corners, spare, rects):
     """Settle a cell (leaf's frame): offer its nearest point, or prove that it holds none; return whether it could.
 
