@@ -22,9 +22,11 @@ from hhsr.kernels.walk import cross_voxel, go_on
 
 WAITING = 3  # so many lanes are without a stride when the others wait for them
 ROOM = 64  # crossings of one segment
-# Instead of a count: a segment that is not finite; one that has no room here, or of a solid without a grid.
+# Instead of a count: a segment that is not finite; one that has no room here, or of a solid without a grid, or of one
+# of gigabytes.
 NOT_FINITE, MANY = -1, -2
 ROW, USED, LIVE = 0, 1, 2
+MOST_SLOTS = 2**28  # of a blob: strides count its bytes in 32 bits
 
 
 @inlined
@@ -47,7 +49,7 @@ def _next_segment(blob, ints, tab, lanes, lane, starts, ends, row, counts, begin
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         if length == 0.0:
             begins[i] = solid_contains(blob, ints, tab, np.int64(0), px, py, pz)
-        elif ints[VOXELS] == 0:
+        elif ints[VOXELS] == 0 or blob.shape[0] > MOST_SLOTS:
             counts[i] = MANY
         elif set_out(blob, ints, lanes, lane, px, py, pz, ex, ey, ez, length):
             lanes[SEGMENT, lane] = i
