@@ -7,7 +7,7 @@ have none; those go on alone to where they have again, and one that is at its en
 import math
 
 import numpy as np
-from numba import njit
+from numba import config, njit
 
 from hhsr.kernels.crossing import scratch
 from hhsr.kernels.lane import BEGIN, COUNT, GAP, LEFT_AT, SEGMENT, STATE, STOP, T, set_out
@@ -22,11 +22,12 @@ from hhsr.kernels.walk import cross_voxel, go_on
 
 WAITING = 3  # so many lanes are without a stride when the others wait for them
 ROOM = 64  # crossings of one segment
-# Instead of a count: a segment that is not finite; one that has no room here, or of a solid without a grid, or of one
-# of gigabytes.
+# Instead of a count: a segment that is not finite; one that has no room here, of a solid without a grid, of one of
+# gigabytes, or with JIT off.
 NOT_FINITE, MANY = -1, -2
 ROW, USED, LIVE = 0, 1, 2
-MOST_SLOTS = 2**28  # of a blob: strides count its bytes in 32 bits
+# Of a blob: strides count its bytes in 32 bits; interpreted there are none.
+MOST_SLOTS = 0 if config.DISABLE_JIT else 2**28  # type: ignore[attr-defined]
 
 
 @inlined
@@ -40,7 +41,8 @@ def _next_segment(blob, ints, tab, lanes, lane, starts, ends, row, counts, begin
         row += 1
         counts[i], begins[i] = 0, False
         ax, ay, az, bx, by, bz = starts[i, 0], starts[i, 1], starts[i, 2], ends[i, 0], ends[i, 1], ends[i, 2]
-        if (ax - ax) + (ay - ay) + (az - az) + (bx - bx) + (by - by) + (bz - bz) != 0.0:
+        finite = math.isfinite(ax) and math.isfinite(ay) and math.isfinite(az)
+        if not (finite and math.isfinite(bx) and math.isfinite(by) and math.isfinite(bz)):
             counts[i] = NOT_FINITE
             continue
         px, py, pz = into_tree(blob, ints, ax, ay, az)
