@@ -19,11 +19,9 @@ NUDGE = 1e-11  # of (a, b): past a cell's border, less than models are proven be
 
 
 @inlined
-def _exit(start, way, low, high):
-    """Return the share x at which start + x·way leaves [low, high]."""
-    if way > 0.0:
-        return (high - start) / way
-    return (low - start) / way if way < 0.0 else 2.0
+def _reach(way, inverse, start, centre, half):
+    """Return the share x at which start + x·way leaves [centre − half, centre + half]; inverse: 1/way."""
+    return (centre + math.copysign(half, way) - start) * inverse if way != 0.0 else 2.0
 
 
 @unmanaged
@@ -50,22 +48,26 @@ def follow_cells(
     # The cell ahead is asked for: on a border the one behind would be left at once, and again and again.
     ahead_a, ahead_b = math.copysign(NUDGE, wa), math.copysign(NUDGE, wb)
     least = NUDGE / max(abs(wa), abs(wb), NUDGE)
+    once_a, once_b = 1.0 / wa, 1.0 / wb
     # What a tolerance is as a share of the stretch: mm for a share are at most these.
     share = tolerance * min(w0, w1) / (length * (end - begin) * max(w0, w1))
     x = 0.0
     while x < 1.0:
         o, ca, cb, half = cell_at(ints, leaf, face, a0 + x * wa + ahead_a, b0 + x * wb + ahead_b)
-        stop = min(_exit(a0, wa, ca - half, ca + half), _exit(b0, wb, cb - half, cb + half))
+        stop = min(_reach(wa, once_a, a0, ca, half), _reach(wb, once_b, b0, cb, half))
         stop = min(max(stop, x + least), 1.0)
         sa, sb, error = float(tab[o + SLOPE_A]), float(tab[o + SLOPE_B]), float(tab[o + ERROR])
         f = w0 - (float(tab[o + VALUE]) + sa * (a0 - ca) + sb * (b0 - cb))
         slope = ww - sa * wa - sb * wb
         f0, f1 = f + x * slope, f + stop * slope
+        if min(f0, f1) > error or max(f0, f1) < -error:
+            if state != (f0 > 0.0):
+                state, count = change(state, f0 > 0.0, share_to_t(x, begin, end, w0, w1), gap, out, count)
+            x = stop
+            continue
         stray_a, stray_b = spreads_of(tab, o, half)
         stray = stray_a * abs(wa) + stray_b * abs(wb)
-        if min(f0, f1) > error or max(f0, f1) < -error:
-            state, count = change(state, f0 > 0.0, share_to_t(x, begin, end, w0, w1), gap, out, count)
-        elif abs(slope) > stray + 1e-9 * (w0 + w1):
+        if abs(slope) > stray + 1e-9 * (w0 + w1):
             state, count = _monotone(
                 blob, ints, leaf, face, a0, b0, w0, a1, b1, w1, x, stop, f0, f1, slope, stray, error,
                 begin, end, share, gap, state, out, count,

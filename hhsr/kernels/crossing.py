@@ -9,8 +9,9 @@ import numpy as np
 from numba import njit
 
 from hhsr.kernels.clipped import follow_tree, merge_touches
-from hhsr.kernels.lane import BEGIN, COUNT, MERGE, ROWS, set_out
+from hhsr.kernels.lane import BEGIN, FIRST_RUN, GAP, LAST_RUN, MERGE, ROWS, RUNS_USED, SPILLED, set_out
 from hhsr.kernels.layout import VOXELS, integers, tables
+from hhsr.kernels.runs import RUN_SIZE, settle_run
 from hhsr.kernels.segment import PIECES, emit
 from hhsr.kernels.tree import into_tree
 from hhsr.kernels.unmanaged import unmanaged
@@ -19,12 +20,40 @@ from hhsr.kernels.voxels import solid_contains
 from hhsr.kernels.walk import go_on
 
 SLOTS = 64  # pending tree nodes of one segment: three a level
+RUNS = 64  # of one segment, before they are settled
 
 
 @njit(cache=True, error_model="numpy")
 def scratch():
-    """Return (work, slots, pending): what one thread needs to follow segments; the lanes are work's last rows."""
-    return np.zeros((PIECES + 1 + ROWS, LANES)), np.empty((SLOTS, 2)), np.empty(SLOTS, dtype=np.int64)
+    """Return (work, slots, pending): what one thread needs to follow segments.
+
+    Rows of work: PIECES for bisections, ROWS for lanes, the rest for the runs of a segment that walks alone.
+    """
+    work = np.empty((PIECES + ROWS + RUNS * RUN_SIZE // LANES, LANES))
+    work[PIECES : PIECES + ROWS] = 0.0
+    return work, np.empty((SLOTS, 2)), np.empty(SLOTS, dtype=np.int64)
+
+
+@unmanaged
+def _walk(
+    blob, ints, tab, px, py, pz, ex, ey, ez, length, resolution, tolerance, first, out, work, slots, pending
+):  # fmt: skip
+    """Return (start state, count) of a segment of some length by the walk of the voxels; count −1: too many runs."""
+    lanes, runs = work[PIECES : PIECES + ROWS], work[PIECES + ROWS :].reshape(RUNS, RUN_SIZE)
+    if not set_out(blob, ints, lanes, 0, px, py, pz, ex, ey, ez, length):
+        return False, np.int64(0)
+    lanes[RUNS_USED, 0] = 0.0
+    gap, count, done = lanes[GAP, 0], np.int64(0), False
+    while not done:
+        done = go_on(blob, ints, tab, lanes, np.int64(0), first, np.bool_(True), runs)
+        if lanes[SPILLED, 0] > 0.0:
+            return False, np.int64(-1)
+        for run in range(int(lanes[RUNS_USED, 0])):
+            count = settle_run(
+                blob, ints, tab, runs, np.int64(run), resolution, tolerance, gap, out, count, work, slots, pending
+            )
+        lanes[RUNS_USED, 0], lanes[FIRST_RUN, 0], lanes[LAST_RUN, 0] = 0.0, -1.0, -1.0
+    return lanes[BEGIN, 0] > 0.0, min(count, np.int64(1)) if first else count
 
 
 @unmanaged
@@ -43,13 +72,11 @@ def follow_segment(
         return solid_contains(blob, ints, tab, root, px, py, pz), np.int64(0)
     gap = MERGE / length
     if root == 0 and ints[VOXELS] != 0:
-        lanes = work[PIECES + 1 :]
-        if not set_out(blob, ints, lanes, 0, px, py, pz, ex, ey, ez, length):
-            return False, np.int64(0)
-        go_on(
-            blob, ints, tab, lanes, np.int64(0), resolution, tolerance, first, np.bool_(True), out, work, slots, pending
+        begin, count = _walk(
+            blob, ints, tab, px, py, pz, ex, ey, ez, length, resolution, tolerance, first, out, work, slots, pending
         )
-        return lanes[BEGIN, 0] > 0.0, np.int64(lanes[COUNT, 0])
+        if count >= 0:
+            return begin, count
     begin = solid_contains(blob, ints, tab, root, px, py, pz)
     state, count, done = follow_tree(
         blob, ints, tab, root, px, py, pz, dx, dy, dz, 0.0, 1.0, gap, resolution, tolerance, first, begin, out,

@@ -1,7 +1,9 @@
 """All crossings of many segments, or the first: some at a time, each in a lane, by the same walk as one alone.
 
 Most of a walk waits for what it reads. So all lanes take their strides together (`hhsr.kernels.stride`), until some
-have none; those go on alone to where they have again, and one that is at its end makes room for the next segment.
+have none; those go on alone to where they have again, and one that is at its end makes room for the next segment. Their
+runs are settled later, some thousands together, in the order of the voxels they lie in: they read the same cells and
+centres.
 """
 
 import math
@@ -10,36 +12,54 @@ import numpy as np
 from numba import config, njit
 
 from hhsr.kernels.crossing import scratch
-from hhsr.kernels.lane import BEGIN, COUNT, GAP, LEFT_AT, SEGMENT, STATE, STOP, T, set_out
+from hhsr.kernels.lane import (
+    BEGIN,
+    FIRST_RUN,
+    FOUND,
+    GAP,
+    LEFT_AT,
+    MERGE,
+    ROWS,
+    RUNS_USED,
+    SEGMENT,
+    SPILLED,
+    STATE,
+    STOP,
+    T,
+    set_out,
+)
 from hhsr.kernels.layout import VOXELS, integers, tables
+from hhsr.kernels.runs import CODE, KEY, KEY_SHIFT, NEXT, RUN_BEGIN, RUN_END, RUN_FROM, RUN_SIZE, RUN_TO, settle_run
 from hhsr.kernels.segment import PIECES
 from hhsr.kernels.stride import stride
+from hhsr.kernels.surfel import PLANE_SIZE
 from hhsr.kernels.tree import into_tree
 from hhsr.kernels.unmanaged import inlined, unmanaged
 from hhsr.kernels.vectors import LANES, bits_set
 from hhsr.kernels.voxels import BASES, BRICK_PLANES, BRICKS, BYTES, DETAILS, PLANES, solid_contains
-from hhsr.kernels.walk import cross_voxel, go_on
+from hhsr.kernels.walk import SPARE, cross_voxel, go_on
 
 WAITING = 3  # so many lanes are without a stride when the others wait for them
-ROOM = 64  # crossings of one segment
+TOGETHER = 8_192  # segments whose runs are settled together
+ROOM = 64  # crossings of one run
 # Instead of a count: a segment that is not finite; one that has no room here, of a solid without a grid, of one of
 # gigabytes, or with JIT off.
 NOT_FINITE, MANY = -1, -2
-ROW, USED, LIVE = 0, 1, 2
+ROW, LIVE = 0, 1
 # Of a blob: strides count its bytes in 32 bits; interpreted there are none.
 MOST_SLOTS = 0 if config.DISABLE_JIT else 2**28  # type: ignore[attr-defined]
 
 
 @inlined
-def _next_segment(blob, ints, tab, lanes, lane, starts, ends, row, counts, begins):
-    """Give a lane the next segment, from a row on, that meets the grid; return the row after it.
+def _next_segment(blob, ints, tab, lanes, lane, starts, ends, row, stop, counts, begins, places):
+    """Give a lane the next segment, from a row on to `stop`, that meets the grid; return the row after it.
 
-    Those before it are settled: counts, begins.
+    Those before it are settled: counts, begins, and places: −1, no runs.
     """
-    while row < starts.shape[0]:
+    while row < stop:
         i = row
         row += 1
-        counts[i], begins[i] = 0, False
+        counts[i], begins[i], places[i] = 0, False, -1
         ax, ay, az, bx, by, bz = starts[i, 0], starts[i, 1], starts[i, 2], ends[i, 0], ends[i, 1], ends[i, 2]
         finite = math.isfinite(ax) and math.isfinite(ay) and math.isfinite(az)
         if not (finite and math.isfinite(bx) and math.isfinite(by) and math.isfinite(bz)):
@@ -68,28 +88,24 @@ def _strode_to_end(lanes, lane):
 
 
 @unmanaged
-def _side_by_side(
-    blob, ints, tab, starts, ends, first, resolution, tolerance, counts, begins, places, ts, found, begun, work, slots,
-    pending,
-):  # fmt: skip
-    """Follow segments in the lanes until all are done; or return False where ts has no room for one more's crossings.
+def _side_by_side(blob, ints, tab, starts, ends, stop, first, counts, begins, places, runs, begun, work):
+    """Walk segments up to row `stop` in the lanes until all are at their ends, or return False: runs have no room.
 
-    begun: (3,) the row of the next segment, slots of ts used, lanes under way; all 0 to begin with, and as they were
-    left to go on. found: (LANES, ROOM) scratch.
+    begun: (2,) the row of the next segment, lanes under way; as they were left to go on. places: the first run of each.
     """
     c = ints[VOXELS]
-    lanes, words = work[PIECES + 1 :], blob.view(np.int32)
+    lanes, words = work[PIECES : PIECES + ROWS], blob.view(np.int32)
     nx, ny, nz, bricks, bases = ints[c], ints[c + 1], ints[c + 2], ints[c + BRICKS], ints[c + BASES]
     octets = ints[c + BYTES]
     brick_planes, planes, details = ints[c + BRICK_PLANES], ints[c + PLANES], ints[c + DETAILS]
-    row, used, live = begun[ROW], begun[USED], begun[LIVE]
-    if row == 0:
+    row, live = begun[ROW], begun[LIVE]
+    if live == 0:
         for lane in range(LANES):
-            row = _next_segment(blob, ints, tab, lanes, lane, starts, ends, row, counts, begins)
+            row = _next_segment(blob, ints, tab, lanes, lane, starts, ends, row, stop, counts, begins, places)
             live += 1 if lanes[SEGMENT, lane] >= 0.0 else 0
     while live > 0:
-        if used + LANES * ROOM > ts.shape[0]:
-            begun[ROW], begun[USED], begun[LIVE] = row, used, live
+        if lanes[RUNS_USED, 0] + SPARE > runs.shape[0]:
+            begun[ROW], begun[LIVE] = row, live
             return False
         while True:
             taken = stride(lanes, words, tab, nx, ny, nz, bricks, bases, octets, brick_planes, planes, details)
@@ -100,32 +116,113 @@ def _side_by_side(
             i = np.int64(lanes[SEGMENT, lane])
             if (taken >> lane) & 1 or i < 0:
                 continue
-            if cross_voxel(blob, ints, tab, lanes, np.int64(lane), tolerance, found[lane]):
-                if not (first and lanes[COUNT, lane] > 0.0 and lanes[T, lane] > found[lane, 0] + lanes[GAP, lane]):
+            if cross_voxel(ints, tab, lanes, np.int64(lane), runs):
+                if not (first and lanes[T, lane] > lanes[FOUND, lane] + lanes[GAP, lane]):
                     continue
             elif not _strode_to_end(lanes, lane) and not go_on(
-                blob, ints, tab, lanes, np.int64(lane), resolution, tolerance, first, np.bool_(False), found[lane],
-                work, slots, pending,
-            ):  # fmt: skip
+                blob, ints, tab, lanes, np.int64(lane), first, np.bool_(False), runs
+            ):
                 continue
-            count = np.int64(lanes[COUNT, lane])
-            if first:
-                count = min(count, 1)
-            begins[i], places[i], counts[i] = lanes[BEGIN, lane] > 0.0, used, count if count <= ROOM else MANY
-            for k in range(count if count <= ROOM else 0):
-                ts[used] = found[lane, k]
-                used += 1
-            row = _next_segment(blob, ints, tab, lanes, lane, starts, ends, row, counts, begins)
+            begins[i], places[i] = lanes[BEGIN, lane] > 0.0, np.int64(lanes[FIRST_RUN, lane])
+            counts[i] = MANY if lanes[SPILLED, lane] > 0.0 else 0
+            row = _next_segment(blob, ints, tab, lanes, lane, starts, ends, row, stop, counts, begins, places)
             live -= 1 if lanes[SEGMENT, lane] < 0.0 else 0
-    begun[ROW], begun[USED], begun[LIVE] = row, used, live
+    begun[ROW], begun[LIVE] = row, 0
     return True
 
 
+@unmanaged
+def most_keys(ints):
+    """Return how many keys of runs there are at most: one for each 2^KEY_SHIFT surfels."""
+    if ints[VOXELS] == 0:
+        return 1
+    record = ints[VOXELS]
+    return ((ints[record + DETAILS] - ints[record + PLANES]) // PLANE_SIZE >> KEY_SHIFT) + 1
+
+
+@inlined
+def _key(runs, run):
+    return int(runs[run, CODE]) // KEY
+
+
+@unmanaged
+def _order_runs(runs, used, bins, order):
+    """Fill order (used,) with the numbers of runs by their keys. bins: more than there are keys; scratch."""
+    bins[:] = 0
+    for run in range(used):
+        bins[_key(runs, run)] += 1
+    total = 0
+    for key in range(bins.shape[0]):
+        total, bins[key] = total + bins[key], total
+    for run in range(used):
+        key = _key(runs, run)
+        order[bins[key]] = run
+        bins[key] += 1
+
+
+@unmanaged
+def _settle(blob, ints, tab, runs, order, used, begun, resolution, tolerance, found, work, slots, pending):
+    """Settle runs in their order: each one's crossings go to `found`, unmerged; return False where that has no room.
+
+    begun: (2,) how many runs are settled, slots of found used; 0 to begin with, and as they were left to go on.
+    """
+    place = begun[1]
+    for k in range(begun[0], used):
+        run = np.int64(order[k])
+        if place + ROOM > found.shape[0]:
+            begun[0], begun[1] = k, place
+            return False
+        count = settle_run(
+            blob, ints, tab, runs, run, resolution, tolerance, -np.inf, found[place : place + ROOM], np.int64(0), work,
+            slots, pending,
+        )  # fmt: skip
+        if count > ROOM:
+            runs[run, CODE] = -1.0
+            continue
+        runs[run, RUN_BEGIN], runs[run, RUN_END] = place, count
+        place += count
+    begun[0], begun[1] = used, place
+    return True
+
+
+@unmanaged
+def _gather(runs, found, first, row, stop, counts, places, ts, used):
+    """Put the crossings of segments row … stop, whose runs are settled, into ts from `used` on; return how many slots.
+
+    counts, places: of each, from the place of its first run. A leaving and an entering that touch are dropped.
+    """
+    for i in range(row, stop):
+        run = places[i]
+        places[i] = used
+        if counts[i] < 0 or run < 0:
+            continue
+        dx, dy, dz = runs[run, RUN_TO] - runs[run, RUN_FROM], runs[run, RUN_TO + 1] - runs[run, RUN_FROM + 1], 0.0
+        dz = runs[run, RUN_TO + 2] - runs[run, RUN_FROM + 2]
+        gap = MERGE * (1.0 / math.sqrt(dx * dx + dy * dy + dz * dz))
+        base = used
+        while run >= 0:
+            if runs[run, CODE] < 0.0:
+                counts[i], used = MANY, base
+                break
+            place = int(runs[run, RUN_BEGIN])
+            for k in range(place, place + int(runs[run, RUN_END])):
+                if used > base and found[k] - ts[used - 1] <= gap:
+                    used -= 1
+                else:
+                    ts[used] = found[k]
+                    used += 1
+            run = int(runs[run, NEXT])
+        if counts[i] >= 0:
+            used = min(used, base + 1) if first else used
+            counts[i] = used - base
+    return used
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _longer(ts):
-    """Return ts (n,) with as much room again behind it."""
-    out = np.empty(2 * ts.shape[0] + LANES * ROOM)
-    out[: ts.shape[0]] = ts
+def _longer(table):
+    """Return a table with as much room again, and more, behind its rows."""
+    out = np.empty((2 * table.shape[0] + LANES * ROOM, *table.shape[1:]))
+    out[: table.shape[0]] = table
     return out
 
 
@@ -138,14 +235,29 @@ def cross_many(blob, starts, ends, first, resolution, tolerance, counts, begins,
     """
     ints, tab = integers(blob), tables(blob)
     work, slots, pending = scratch()
-    found, ts, begun = np.empty((LANES, ROOM)), np.empty(2 * ROOM + starts.shape[0]), np.zeros(3, dtype=np.int64)
-    work[PIECES + 1 + SEGMENT] = -1.0
-    while not _side_by_side(
-        blob, ints, tab, starts, ends, first, resolution, tolerance, counts, begins, places, ts, found, begun, work,
-        slots, pending,
-    ):  # fmt: skip
-        ts = _longer(ts)
-    return ts[: begun[USED]]
+    n = starts.shape[0]
+    runs = np.empty((2 * min(n, TOGETHER) + 8 * SPARE, RUN_SIZE))
+    found, ts, begun = np.empty(2 * ROOM), np.empty(ROOM + n), np.zeros(2, dtype=np.int64)
+    bins, used, row = np.empty(most_keys(ints), dtype=np.int32), 0, 0
+    while row < n:
+        stop = min(row + TOGETHER, n)
+        begun[ROW], begun[LIVE] = row, 0
+        work[PIECES + RUNS_USED, 0] = 0.0
+        while not _side_by_side(blob, ints, tab, starts, ends, stop, first, counts, begins, places, runs, begun, work):
+            runs = _longer(runs)
+        kept = int(work[PIECES + RUNS_USED, 0])
+        order = np.empty(kept, dtype=np.int32)
+        _order_runs(runs, kept, bins, order)
+        begun[:] = 0
+        while not _settle(
+            blob, ints, tab, runs, order, kept, begun, resolution, tolerance, found, work, slots, pending
+        ):
+            found = _longer(found)
+        while used + begun[1] > ts.shape[0]:
+            ts = _longer(ts)
+        used = _gather(runs, found, first, row, stop, counts, places, ts, used)
+        row = stop
+    return ts[:used]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -17,14 +17,16 @@ from hhsr.kernels.voxels import BRICK, LEAPS, OCTANT_WORDS, STEPS
 # where the octant's tables begin.
 U, V, INVERSE, SHIFT, SIGN, BACK = 0, 3, 6, 9, 12, 15
 T, STOP, NUDGED, STATE, LEAP_TABLE, STEP_TABLE = 18, 19, 20, 21, 22, 23
-# Tree's frame, mm: start, end; the length; MERGE of it. |v|. The start's state; whether a proven voxel's state stands
-# up to t; crossings so far; the owner of the last voxel, where a cut passed it, else −1; the t it was left at; the
-# number of the segment, −1 of an empty lane.
-START, END, LENGTH, GAP, SPEED = 24, 27, 30, 31, 32
-BEGIN, SURE, COUNT, LAST, LEFT_AT, SEGMENT = 33, 34, 35, 36, 37, 38
+# Tree's frame, mm: start, end. MERGE as a share of the segment; |v|. The start's state; whether a proven voxel's state
+# stands up to t; the owner of the last voxel, where a cut passed it, else −1; the t it was left at; the number of the
+# segment, −1 of an empty lane.
+START, END, GAP, SPEED, BEGIN, SURE, LAST, LEFT_AT, SEGMENT = 24, 27, 30, 31, 32, 33, 34, 35, 36
+# Runs (`hhsr.kernels.runs`): the segment's first and last, −1 if none; t up to which the state surely changed, infinite
+# if it did not; whether there was no room for one; in lane 0, how many all lanes have.
+FIRST_RUN, LAST_RUN, FOUND, SPILLED, RUNS_USED = 37, 38, 39, 40, 41
 # Of the voxel that the last stride did not take, where its plane leaves the state open: number of the surfel (else −1),
 # the plane's value at t and change by t, and where the segment leaves the voxel.
-SURFEL, DEPTH, SLOPE, EXIT, ROWS = 39, 40, 41, 42, 43
+SURFEL, DEPTH, SLOPE, EXIT, ROWS = 42, 43, 44, 45, 46
 
 MERGE = 1e-9  # mm: a leaving and an entering closer than this are one touch
 NUDGE = 1e-7  # mm (and voxels) past a voxel's border: less than voxels and planes are proven beyond theirs
@@ -72,7 +74,9 @@ def set_out(blob, ints, lanes, lane, px, py, pz, qx, qy, qz, length):
     lanes[STEP_TABLE, lane] = ints[c + STEPS] + octant * ints[c + OCTANT_WORDS]
     lanes[START, lane], lanes[START + 1, lane], lanes[START + 2, lane] = px, py, pz
     lanes[END, lane], lanes[END + 1, lane], lanes[END + 2, lane] = qx, qy, qz
-    lanes[LENGTH, lane], lanes[GAP, lane] = length, MERGE * once
+    lanes[GAP, lane] = MERGE * once
     lanes[SPEED, lane] = math.sqrt(vx * vx + vy * vy + vz * vz)
-    lanes[SURE, lane], lanes[COUNT, lane], lanes[LAST, lane], lanes[LEFT_AT, lane] = 0.0, 0.0, -1.0, t
+    lanes[SURE, lane], lanes[LAST, lane], lanes[LEFT_AT, lane] = 0.0, -1.0, t
+    lanes[FIRST_RUN, lane], lanes[LAST_RUN, lane] = -1.0, -1.0
+    lanes[FOUND, lane], lanes[SPILLED, lane] = np.inf, 0.0
     return True

@@ -68,23 +68,25 @@ def emit_stride(builder: Any, lanes: Any, words: Any, tab: Any, grid: Sequence[A
     *normal, offset = gather_four(builder, tab, brick_planes + (slot << 2))
     level = _linear(normal, [place[k] - ((voxel[k] | 3) - 1).doubles() for k in range(3)]) + offset
     slope = _linear(normal, way)
-    far = ~leaps & (abs(level) > 1.0)
+    plain = ~leaps & (abs(level) > 1.0)
     near = t + (abs(level) - 1.0) / abs(slope)
-    nears = far & ((level > 0.0) ^ (slope > 0.0))
+    far = ((level > 0.0) ^ (slope > 0.0)).where(near, float("inf"))
     inner = ((voxel[0] & 3) << 4) | ((voxel[1] & 3) << 2) | (voxel[2] & 3)
     byte = _byte(builder, words, octets + (slot << 6) + inner)
     step = gather(builder, words, row(STEP_TABLE).integers() + (slot * STEP_WORDS) + (inner >> 4))
     step = (step >> ((inner & 15) * STEP_BITS)) & FARTHEST_STEP
-    whole = leaps | far
-    proven, byte_in = ~whole & (byte > NO_SURFEL), byte < OUT_BYTE
-    surfel = ~whole & (byte < NO_SURFEL)
+    proven, byte_in = ~leaps & (byte > NO_SURFEL), byte < OUT_BYTE
+    surfel = ~leaps & ~plain & (byte < NO_SURFEL)
     number = gather(builder, words, bases + slot) + surfel.where(byte, 0)
-    reach = leaps.where(leaps_in.where(leap, (leap ^ 255) + 1), power_of_two(proven.where(step, 0))).doubles()
-    end = nears.where(near, float("inf")).least(stop)
+    reach = leaps.where(leaps_in.where(leap, (leap ^ 255) + 1), power_of_two(proven.where(step, 0)))
+    far_out, end = reach.doubles(), None
     for k in (2, 1, 0):
-        border = whole.where(voxel[k] >> 2, voxel[k]).doubles() + row(SIGN + k) * reach + row(BACK + k)
-        border = whole.where(border * 4.0, border)
-        end = (border * row(INVERSE + k) + row(SHIFT + k)).least(end)
+        forth, back, once, shift = row(SIGN + k), row(BACK + k), row(INVERSE + k), row(SHIFT + k)
+        border = leaps.where(voxel[k] >> 2, voxel[k]).doubles() + forth * far_out + back
+        met = leaps.where(border * 4.0, border) * once + shift
+        end = met if end is None else met.least(end)
+        far = ((((voxel[k] >> 2).doubles() + forth + back) * 4.0) * once + shift).least(far)
+    end = plain.where(proven.where(end.most(far), far), end).least(stop)
     *normal, offset = gather_four(builder, tab, planes + (number << 2))
     depth = _linear(normal, [place[k] - voxel[k].doubles() - 0.5 for k in range(3)]) + offset
     slope = _linear(normal, way)
@@ -96,8 +98,8 @@ def emit_stride(builder: Any, lanes: Any, words: Any, tab: Any, grid: Sequence[A
     store(builder, (left_open & depth.is_(depth)).where(number.doubles(), -1.0), lanes, SURFEL * LANES)
     for number_of, value in ((DEPTH, depth), (SLOPE, slope), (EXIT, end)):
         store(builder, value, lanes, number_of * LANES)
-    settled = whole | proven | (surfel & (above | below))
-    inside = leaps.where(leaps_in, far.where(level < 0.0, proven.where(byte_in, below)))
+    settled = leaps | plain | proven | (surfel & (above | below))
+    inside = leaps.where(leaps_in, plain.where(level < 0.0, proven.where(byte_in, below)))
     # What the start's voxel proves is the state to begin with.
     begins, held = state < 0.0, inside.doubles()
     taken = settled & (begins | held.is_(state)) & (t < stop)

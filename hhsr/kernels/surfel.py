@@ -168,8 +168,26 @@ def owner_of_box(blob, ints, node, x, y, z, half):
 
 
 @unmanaged
-def _prove_side(blob, ints, tab, owner, x, y, z, half, side, q, e, acc, plane, out):
-    """Return IN, OUT or MIXED of a voxel in one owner's region, filling out (SURFEL_SIZE,) float32; −1: no surfel."""
+def _highest(gx, gy, gz, nx, ny, nz, c, half):
+    """Return an upper bound of g·u over the cube |u|∞ ≤ half where n·u ≤ c: the dual's least value, so the very one.
+
+    For any share s ≥ 0, g·u ≤ (g − s·n)·u + s·c there; the best s is 0 or takes one of the axes out.
+    """
+    best = (abs(gx) + abs(gy) + abs(gz)) * half
+    for k in range(3):
+        g, n = (gx, nx) if k == 0 else ((gy, ny) if k == 1 else (gz, nz))
+        if g * n > 0.0:
+            s = g / n
+            best = min(best, (abs(gx - s * nx) + abs(gy - s * ny) + abs(gz - s * nz)) * half + s * c)
+    return best
+
+
+@unmanaged
+def _prove_side(blob, ints, tab, owner, x, y, z, half, side, nx, ny, nz, c, q, e, acc, plane, out):
+    """Return IN, OUT or MIXED of a voxel in one owner's region, filling out (SURFEL_SIZE,) float32; −1: no surfel.
+
+    n·u ≤ c: the part of the voxel that counts, in units of `side` from its centre; n is 0 where it is all.
+    """
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
     if ints[o + OWNER_KIND] != MODEL:
         return -1
@@ -184,11 +202,13 @@ def _prove_side(blob, ints, tab, owner, x, y, z, half, side, q, e, acc, plane, o
         gx, gy, gz, level = gx * side, gy * side, gz * side, plane[OFFSET]
         steep = abs(gx) + abs(gy) + abs(gz)
         reach = steep * (half / side)
+        rise = _highest(gx, gy, gz, nx, ny, nz, c, half / side)
+        fall = _highest(-gx, -gy, -gz, nx, ny, nz, c, half / side)
         # The numbers are float32, and a segment's place along it is rounded: far less than a millionth of a voxel.
         thick = (plane[DETAIL + THICK] + 1e-6 * reach + 1e-6 * steep + 1e-6 * abs(level)) * (1.0 + 1e-6)
-        if level - reach > thick:
+        if level - fall > thick:
             state = OUT
-        elif level + reach < -thick:
+        elif level + rise < -thick:
             state = IN
         elif reach < thick:  # the plane decides nothing: a few cells' own planes may
             state = leaf_box_state(blob, ints, tab, leaf, q, e)
@@ -220,10 +240,15 @@ def prove_voxel(blob, ints, tab, x, y, z, half, side, q, e, acc, plane, out, lef
     half += SLACK + 1e-9 * (abs(x) + abs(y) + abs(z))
     owner = owner_of_box(blob, ints, 0, x, y, z, half)
     if owner >= 0:
-        return _prove_side(blob, ints, tab, owner, x, y, z, half, side, q, e, acc, plane, out)
+        return _prove_side(
+            blob, ints, tab, owner, x, y, z, half, side, 0.0, 0.0, 0.0, 0.0, q, e, acc, plane, out
+        )  # fmt: skip
     node = -1 - owner
-    if blob[ints[NODE_FLOATS] + NODE_FLOAT_SIZE * node + 4] > 0.0:
+    f = ints[NODE_FLOATS] + NODE_FLOAT_SIZE * node
+    if blob[f + 4] > 0.0:
         return -1
+    nx, ny, nz = blob[f], blob[f + 1], blob[f + 2]
+    c = (blob[f + 3] - (nx * x + ny * y + nz * z)) / side
     i = ints[NODE_INTS] + NODE_INT_SIZE * node
     one, other = (
         owner_of_box(blob, ints, ints[i + 1], x, y, z, half),
@@ -231,10 +256,15 @@ def prove_voxel(blob, ints, tab, x, y, z, half, side, q, e, acc, plane, out, lef
     )
     if one < 0 or other < 0:
         return -1
-    state = _prove_side(blob, ints, tab, one, x, y, z, half, side, q, e, acc, plane, left)
+    # A millionth of a voxel past the cut: where a segment meets it is rounded.
+    state = _prove_side(
+        blob, ints, tab, one, x, y, z, half, side, nx, ny, nz, c + 1e-6 * (1.0 + abs(c)), q, e, acc, plane, left
+    )
     if state < 0:
         return -1
-    second = _prove_side(blob, ints, tab, other, x, y, z, half, side, q, e, acc, plane, right)
+    second = _prove_side(
+        blob, ints, tab, other, x, y, z, half, side, -nx, -ny, -nz, -c + 1e-6 * (1.0 + abs(c)), q, e, acc, plane, right
+    )
     if second < 0:
         return -1
     if state == second and state != MIXED:

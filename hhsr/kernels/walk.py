@@ -10,22 +10,20 @@ import math
 import numpy as np
 
 from hhsr.kernels.cell import leaf_implicit
-from hhsr.kernels.chart_walk import follow_cells
-from hhsr.kernels.clipped import follow_tree, merge_touches
 from hhsr.kernels.lane import (
     BACK,
     BEGIN,
-    COUNT,
     DEPTH,
     END,
     EXIT,
+    FOUND,
     GAP,
     INVERSE,
     LAST,
     LEAP_TABLE,
     LEFT_AT,
-    LENGTH,
     NUDGED,
+    RUNS_USED,
     SHIFT,
     SIGN,
     SLOPE,
@@ -39,21 +37,11 @@ from hhsr.kernels.lane import (
     T,
     U,
     V,
-)  # fmt: skip
-from hhsr.kernels.layout import (
-    FRAME,
-    NODE_FLOAT_SIZE,
-    NODE_FLOATS,
-    OWNER_INT_SIZE,
-    OWNER_INTS,
-    OWNER_RECORD,
-    ROTATED,
-    VOXELS,
 )
-from hhsr.kernels.segment import PIECES
-from hhsr.kernels.stretch import change, root_in
+from hhsr.kernels.layout import NODE_FLOAT_SIZE, NODE_FLOATS, OWNER_INT_SIZE, OWNER_INTS, OWNER_RECORD, VOXELS
+from hhsr.kernels.runs import MONOTONE, NONE, OWN, OWNER, RUN_BEGIN, close, enter, note
 from hhsr.kernels.surfel import BEND, DETAIL_SIZE, EXTRA, OFFSET, PLANE_SIZE, SURFEL_OWNER, THICK, TURN
-from hhsr.kernels.tree import into_leaf, turn_into_leaf
+from hhsr.kernels.tree import into_leaf
 from hhsr.kernels.unmanaged import inlined, unmanaged
 from hhsr.kernels.voxels import (
     BASES,
@@ -71,55 +59,8 @@ from hhsr.kernels.voxels import (
     solid_contains,
 )
 
+SPARE = 8  # records that are left when a walk alone waits for its runs to be settled
 UNKNOWN = 2
-NONE, MONOTONE, OWN, CLIPPED = 0, 1, 2, 3  # kinds of runs: F is proven monotone; one leaf's; anybody's
-# A run, in the last row of the scratch: from which t, its owner, the sign of dF/dt, the least and greatest |dF/dt|,
-# |d²F/dt²|, and where F is about 1.
-RUN, RUN_START, RUN_OWNER, RUN_SIGN, RUN_LEAST, RUN_MOST, RUN_BEND, RUN_GUESS = PIECES, 0, 1, 2, 3, 4, 5, 6
-
-
-@inlined
-def _cross_leaf(
-    blob, ints, leaf, px, py, pz, dx, dy, dz, begin, end, guess, rises, least, most, bend, tolerance
-):  # fmt: skip
-    """Return where p + t·d (tree's frame) crosses a leaf's surface: `hhsr.kernels.stretch.root_in`."""
-    px, py, pz = into_leaf(blob, ints, leaf, px, py, pz)
-    if ints[leaf + ROTATED] != 0:
-        dx, dy, dz = turn_into_leaf(blob, ints[leaf + FRAME], dx, dy, dz)
-    return root_in(blob, ints, leaf, px, py, pz, dx, dy, dz, begin, end, guess, rises, least, most, bend, tolerance)
-
-
-@inlined
-def _close_run(
-    blob, ints, tab, kind, px, py, pz, dx, dy, dz, length, end, new, resolution, tolerance, gap, state, out, count,
-    work, slots, pending,
-):  # fmt: skip
-    """Settle the pending run, which ends at t = `end` in the state `new`; return (state, count)."""
-    begin = work[RUN, RUN_START]
-    if kind == MONOTONE and state == new:
-        return state, count
-    if kind == CLIPPED:
-        state, count, _ = follow_tree(
-            blob, ints, tab, np.int64(0), px, py, pz, dx, dy, dz, begin, end, gap, resolution, tolerance,
-            np.bool_(False), state, out, count, work, slots, pending,
-        )  # fmt: skip
-        state, count = change(state, new, end, gap, out, count)
-        return state, merge_touches(out, count, gap)
-    leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * int(work[RUN, RUN_OWNER]) + OWNER_RECORD]
-    if kind == MONOTONE:
-        end = _cross_leaf(
-            blob, ints, leaf, px, py, pz, dx, dy, dz, begin, end, work[RUN, RUN_GUESS], work[RUN, RUN_SIGN] > 0.0,
-            work[RUN, RUN_LEAST], work[RUN, RUN_MOST], work[RUN, RUN_BEND], tolerance / length,
-        )  # fmt: skip
-    else:
-        px, py, pz = into_leaf(blob, ints, leaf, px, py, pz)
-        if ints[leaf + ROTATED] != 0:
-            dx, dy, dz = turn_into_leaf(blob, ints[leaf + FRAME], dx, dy, dz)
-        state, count = follow_cells(
-            blob, ints, tab, leaf, px, py, pz, dx, dy, dz, length, begin, end, resolution, tolerance, gap, state, out,
-            count, work,
-        )  # fmt: skip
-    return change(state, new, end, gap, out, count)
 
 
 @unmanaged
@@ -131,32 +72,11 @@ def _holds(blob, ints, owner, x, y, z):
 
 
 @inlined
-def _enter(kind, work, a, b, owner, slope, stray, bend, guess):
-    """Add [a, b] of a voxel to the run, or begin one; return the run's kind. Owner −1: a voxel without a surfel."""
-    new = CLIPPED if owner < 0 else (MONOTONE if abs(slope) > stray else OWN)
-    if kind == NONE:
-        work[RUN, RUN_START], work[RUN, RUN_OWNER], work[RUN, RUN_SIGN] = a, owner, slope
-        work[RUN, RUN_LEAST], work[RUN, RUN_MOST] = abs(slope) - stray, abs(slope) + stray
-        work[RUN, RUN_BEND], work[RUN, RUN_GUESS] = bend, guess
-        return new
-    if kind == CLIPPED or new == CLIPPED or work[RUN, RUN_OWNER] != owner:
-        return CLIPPED
-    work[RUN, RUN_BEND] = max(work[RUN, RUN_BEND], bend)
-    if kind == MONOTONE and new == MONOTONE and (work[RUN, RUN_SIGN] > 0.0) == (slope > 0.0):
-        work[RUN, RUN_LEAST] = min(work[RUN, RUN_LEAST], abs(slope) - stray)
-        work[RUN, RUN_MOST] = max(work[RUN, RUN_MOST], abs(slope) + stray)
-        if guess >= a:  # the plane of this voxel is the one that the crossing lies on, or past
-            work[RUN, RUN_GUESS] = guess
-        return MONOTONE
-    return OWN
+def go_on(blob, ints, tab, lanes, lane, first, alone, runs):
+    """Go on with the walk in a lane, keeping its runs (n, RUN_SIZE); return whether it is at its end.
 
-
-@inlined
-def go_on(blob, ints, tab, lanes, lane, resolution, tolerance, first, alone, out, work, slots, pending):
-    """Go on with the walk in a lane; return whether it is at its end.
-
-    alone: to the end. Else to a voxel that may be left by strides of all lanes (`hhsr.kernels.stride`), no run being
-    pending. first: to the first crossing at most. out: (k,) t of each change of state.
+    alone: to the end, or until there is little room for runs. Else to a voxel that may be left by strides of all lanes
+    (`hhsr.kernels.stride`). No run is pending then. first: to the first place that the state has surely changed at.
     """
     octets, words = blob.view(np.uint8), blob.view(np.int32)
     c = ints[VOXELS]
@@ -175,35 +95,33 @@ def go_on(blob, ints, tab, lanes, lane, resolution, tolerance, first, alone, out
     sx, sy, sz = int(lanes[SIGN, lane]), int(lanes[SIGN + 1, lane]), int(lanes[SIGN + 2, lane])
     ox, oy, oz = int(lanes[BACK, lane]), int(lanes[BACK + 1, lane]), int(lanes[BACK + 2, lane])
     t, stop, nudge = lanes[T, lane], lanes[STOP, lane], lanes[NUDGED, lane]
-    length, gap, speed = lanes[LENGTH, lane], lanes[GAP, lane], lanes[SPEED, lane]
+    gap, speed = lanes[GAP, lane], lanes[SPEED, lane]
     begun, begin, state = lanes[STATE, lane] >= 0.0, lanes[BEGIN, lane] > 0.0, lanes[STATE, lane] > 0.0
     strode = t != lanes[LEFT_AT, lane]
     sure, last = strode or lanes[SURE, lane] > 0.0, -1 if strode else int(lanes[LAST, lane])
-    done = True
-    count, kind, closing, at = int(lanes[COUNT, lane]), np.int64(NONE), UNKNOWN, 0.0
+    last_surfel = np.int64(-1)
+    kind, done, full = np.int64(NONE), True, runs.shape[0] - SPARE
     while True:
-        if closing != UNKNOWN:
-            state, count = _close_run(
-                blob, ints, tab, kind, px, py, pz, dx, dy, dz, length, at, closing == 1, resolution, tolerance, gap,
-                state, out, count, work, slots, pending,
-            )  # fmt: skip
-            kind, closing = np.int64(NONE), UNKNOWN
-        if first and count > 0 and (t if kind == NONE else work[RUN, RUN_START]) > out[0] + gap:
+        if kind == NONE and lanes[RUNS_USED, 0] > full:
+            done = False
+            break
+        if first and (t if kind == NONE else runs[int(lanes[RUNS_USED, 0]), RUN_BEGIN]) > lanes[FOUND, lane] + gap:
             break
         if t >= stop:
             # The end has its own state: along a cutting plane it may not be the one that the walk came with.
             holds = stop >= 1.0 and (state if sure else solid_contains(blob, ints, tab, np.int64(0), qx, qy, qz))
             if kind == NONE:
-                state, count = change(state, holds, stop, gap, out, count)
-                break
-            closing, at = (1 if holds else 0), stop
-            continue
+                note(runs, lanes, lane, state, holds, stop)
+            else:
+                close(kind, runs, lanes, lane, state, holds, stop, last_surfel)
+            state = holds
+            break
         x, y, z = ux + t * vx, uy + t * vy, uz + t * vz
         i, j, k = min(max(int(x), 0), top_x), min(max(int(y), 0), top_y), min(max(int(z), 0), top_z)
         bi, bj, bk = i >> 2, j >> 2, k >> 2
         brick = (bi * ny + bj) * nz + bk
         leap = np.int64(octets[leaps + brick])
-        known, surfel, near = UNKNOWN, -1, np.inf
+        known, surfel, plain, proven, far, r = UNKNOWN, np.int64(-1), False, False, np.inf, np.int64(1)
         if leap != 0:
             known = 1 if leap < 128 else 0
             r = leap if leap < 128 else 256 - leap
@@ -215,34 +133,38 @@ def go_on(blob, ints, tab, lanes, lane, resolution, tolerance, first, alone, out
             o = brick_planes + PLANE_SIZE * slot
             gx, gy, gz = np.float64(tab[o]), np.float64(tab[o + 1]), np.float64(tab[o + 2])
             l0 = gx * (x - ((i | 3) - 1)) + gy * (y - ((j | 3) - 1)) + gz * (z - ((k | 3) - 1)) + tab[o + OFFSET]
-            if abs(l0) > 1.0:
-                # The brick's own plane decides, up to where the segment comes near it.
+            inner = ((i & 3) << 4) | ((j & 3) << 2) | (k & 3)
+            byte = np.int64(octets[voxels + 64 * slot + inner])
+            proven = byte > NO_SURFEL
+            if proven:
+                known = 1 if byte < OUT_BYTE else 0
+                step = np.int64(words[steps + STEP_WORDS * slot + (inner >> 4)]) >> (STEP_BITS * (inner & 15))
+                r <<= step & FARTHEST_STEP
+            plain = abs(l0) > 1.0
+            if plain:
+                # The brick's own plane decides, up to where the segment comes near it; or the voxel goes on farther.
                 known = 1 if l0 < 0.0 else 0
                 slope = gx * vx + gy * vy + gz * vz
                 if (l0 > 0.0) != (slope > 0.0) and slope != 0.0:
-                    near = t + (abs(l0) - 1.0) / abs(slope)
+                    far = t + (abs(l0) - 1.0) / abs(slope)
                 ex = ((bi + sx + ox) << 2) * ix + kx
                 ey = ((bj + sy + oy) << 2) * iy + ky
                 ez = ((bk + sz + oz) << 2) * iz + kz
-            else:
-                inner = ((i & 3) << 4) | ((j & 3) << 2) | (k & 3)
-                byte = np.int64(octets[voxels + 64 * slot + inner])
-                r = np.int64(1)
-                if byte > NO_SURFEL:
-                    known = 1 if byte < OUT_BYTE else 0
-                    step = np.int64(words[steps + STEP_WORDS * slot + (inner >> 4)]) >> (STEP_BITS * (inner & 15))
-                    r <<= step & FARTHEST_STEP
-                elif byte < NO_SURFEL:
-                    surfel = np.int64(words[bases + slot]) + byte
-                ex = (i + sx * r + ox) * ix + kx
-                ey = (j + sy * r + oy) * iy + ky
-                ez = (k + sz * r + oz) * iz + kz
+                far = min(min(ex, ey), min(ez, far))
+            elif byte < NO_SURFEL:
+                surfel = np.int64(words[bases + slot]) + byte
+            ex = (i + sx * r + ox) * ix + kx
+            ey = (j + sy * r + oy) * iy + ky
+            ez = (k + sz * r + oz) * iz + kz
         if not begun:
             begun = True
             begin = known == 1 if known != UNKNOWN else solid_contains(blob, ints, tab, np.int64(0), px, py, pz)
             state = begin
         sure = known != UNKNOWN and kind == NONE
-        end = min(min(ex, ey), min(min(ez, near), stop))
+        end = min(min(ex, ey), ez)
+        if plain:
+            end = max(end, far) if proven else far
+        end = min(end, stop)
         a, b, after, owner, cut = t, end, UNKNOWN, -1, False
         slope = stray = bend = guess = 0.0
         if surfel >= 0:
@@ -259,7 +181,7 @@ def go_on(blob, ints, tab, lanes, lane, resolution, tolerance, first, alone, out
                     right = (t >= meet) == (g > 0.0)
                     if t < meet:
                         end = min(end, meet)
-                surfel = int(tab[o + EXTRA]) + (1 if right else 0)
+                surfel = np.int64(tab[o + EXTRA]) + (1 if right else 0)
             o = planes + PLANE_SIZE * surfel
             gx, gy, gz = np.float64(tab[o]), np.float64(tab[o + 1]), np.float64(tab[o + 2])
             slope = gx * vx + gy * vy + gz * vz
@@ -275,7 +197,7 @@ def go_on(blob, ints, tab, lanes, lane, resolution, tolerance, first, alone, out
                 o = details + DETAIL_SIZE * surfel
                 owner = int(tab[o + SURFEL_OWNER])
             if decided:
-                surfel = -1
+                surfel = np.int64(-1)
             else:
                 if known != UNKNOWN:
                     a = t + (abs(l0) - 1.0) / abs(slope)
@@ -285,38 +207,41 @@ def go_on(blob, ints, tab, lanes, lane, resolution, tolerance, first, alone, out
                 slope *= np.float64(tab[o + THICK])
                 stray, bend = speed * np.float64(tab[o + TURN]), speed * speed * np.float64(tab[o + BEND])
             # Beyond a cut the run, or the state before it, is another owner's: exact states part the two.
-            foreign = cut and (kind == MONOTONE or kind == OWN) and work[RUN, RUN_OWNER] != owner
+            foreign = cut and (kind == MONOTONE or kind == OWN) and runs[int(lanes[RUNS_USED, 0]), OWNER] != owner
             if foreign or (cut and kind == NONE and known == UNKNOWN and last >= 0 and last != owner):
-                asked = int(work[RUN, RUN_OWNER]) if foreign else owner
+                asked = int(runs[int(lanes[RUNS_USED, 0]), OWNER]) if foreign else owner
                 holds = _holds(blob, ints, asked, px + t * dx, py + t * dy, pz + t * dz)
                 if foreign:
-                    closing, at = (1 if holds else 0), t
-                    continue
-                state, count = change(state, holds, t, gap, out, count)
+                    close(kind, runs, lanes, lane, state, holds, t, last_surfel)
+                    state, kind = holds, np.int64(NONE)
+                    continue  # look at this voxel again, without a run
+                note(runs, lanes, lane, state, holds, t)
+                state = holds
         last = owner if cut else -1
         if known != UNKNOWN:
-            if kind != NONE:
-                closing, at = known, t
-                if surfel >= 0:
-                    continue  # close the run first, then look at this voxel again
-            elif state != (known == 1):
-                state, count = change(state, known == 1, t, gap, out, count)
+            if kind == NONE:
+                note(runs, lanes, lane, state, known == 1, t)
+            else:
+                close(kind, runs, lanes, lane, state, known == 1, t, last_surfel)
+            state, kind = known == 1, np.int64(NONE)
         if surfel >= 0 or known == UNKNOWN:
-            kind = _enter(kind, work, a, max(a, b), owner, slope, stray, bend, guess)
+            kind = enter(kind, runs, lanes, a, max(a, b), owner, slope, stray, bend, guess)
+            last_surfel = surfel
             if after != UNKNOWN:
-                closing, at = after, max(a, b)
+                close(kind, runs, lanes, lane, state, after == 1, max(a, b), surfel)
+                state, kind = after == 1, np.int64(NONE)
         t = max(end, t) + nudge
-        if not alone and kind == NONE and closing == UNKNOWN and t < stop and not (first and count > 0):
+        if not alone and kind == NONE and t < stop and not (first and lanes[FOUND, lane] < np.inf):
             done = False
             break
     lanes[T, lane] = lanes[LEFT_AT, lane] = t
     lanes[STATE, lane], lanes[BEGIN, lane] = 1.0 if state else 0.0, 1.0 if begin else 0.0
-    lanes[SURE, lane], lanes[COUNT, lane], lanes[LAST, lane] = 1.0 if sure else 0.0, count, last
+    lanes[SURE, lane], lanes[LAST, lane] = 1.0 if sure else 0.0, last
     return done
 
 
 @inlined
-def cross_voxel(blob, ints, tab, lanes, lane, tolerance, out):
+def cross_voxel(ints, tab, lanes, lane, runs):
     """Take a lane through the voxel where its stride ended if its surfel settles that; return whether it did.
 
     What `go_on` does most often: no run is pending, the plane proves the state behind the voxel and F monotone in it.
@@ -335,22 +260,12 @@ def cross_voxel(blob, ints, tab, lanes, lane, tolerance, out):
     if abs(slope * thick) <= stray:
         return False
     if (l1 < 0.0) != state:
-        count = int(lanes[COUNT, lane])
-        if count >= out.shape[0]:
-            return False
         a = t + (abs(l0) - 1.0) / abs(slope) if sure else t
         b = max(a, end - (abs(l1) - 1.0) / abs(slope))
-        guess = t - l0 / slope
-        slope *= thick
-        px, py, pz = lanes[START, lane], lanes[START + 1, lane], lanes[START + 2, lane]
-        leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * int(tab[o + SURFEL_OWNER]) + OWNER_RECORD]
-        root = _cross_leaf(
-            blob, ints, leaf, px, py, pz, lanes[END, lane] - px, lanes[END + 1, lane] - py, lanes[END + 2, lane] - pz,
-            a, b, guess, slope > 0.0, abs(slope) - stray, abs(slope) + stray, speed * speed * np.float64(tab[o + BEND]),
-            tolerance / lanes[LENGTH, lane],
-        )  # fmt: skip
-        state, count = change(state, not state, root, lanes[GAP, lane], out, count)
-        lanes[STATE, lane], lanes[COUNT, lane] = 1.0 if state else 0.0, count
+        bend = speed * speed * np.float64(tab[o + BEND])
+        enter(np.int64(NONE), runs, lanes, a, b, int(tab[o + SURFEL_OWNER]), slope * thick, stray, bend, t - l0 / slope)
+        close(np.int64(MONOTONE), runs, lanes, lane, state, not state, b, np.int64(surfel))
+        lanes[STATE, lane] = 0.0 if state else 1.0
     t = max(end, t) + lanes[NUDGED, lane]
     lanes[T, lane] = lanes[LEFT_AT, lane] = t
     lanes[SURE, lane], lanes[LAST, lane] = 1.0 if sure else 0.0, -1.0

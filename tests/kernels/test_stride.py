@@ -85,7 +85,8 @@ def twin(tables: Tables, lanes: np.ndarray, lane: int) -> tuple[bool, float, flo
     voxel = np.clip(place.astype(int), 0, 4 * np.array(SHAPE) - 1)
     brick = int(np.ravel_multi_index(tuple(voxel // 4), SHAPE))
     leap = int(tables.bytes[int(lanes[at.LEAP_TABLE, lane]) + brick])
-    cell, size, reach, near, surfel = voxel, 1, 1, math.inf, -1
+    cell, size, reach, far, surfel = voxel, 1, 1, math.inf, -1
+    plain = proven = False
     known: bool | None = None
     slot = int(tables.words[tables.bricks + brick])
     if leap:
@@ -97,18 +98,27 @@ def twin(tables: Tables, lanes: np.ndarray, lane: int) -> tuple[bool, float, flo
         slope = gx * way[0] + gy * way[1] + gz * way[2]
         inner = int(voxel[0] % 4 * 16 + voxel[1] % 4 * 4 + voxel[2] % 4)
         byte = int(tables.bytes[tables.octets + 64 * slot + inner])
-        if abs(level) > 1.0:
-            cell, size, known = voxel // 4, 4, bool(level < 0.0)
-            if (level > 0.0) != (slope > 0.0) and slope != 0.0:
-                near = t + (abs(level) - 1.0) / abs(slope)
-        elif byte > NO_SURFEL:
+        plain, proven = abs(level) > 1.0, byte > NO_SURFEL
+        if proven:
             known = byte < OUT_BYTE
             word = int(np.uint32(tables.words[int(lanes[at.STEP_TABLE, lane]) + STEP_WORDS * slot + inner // 16]))
             reach = 1 << (word >> STEP_BITS * (inner % 16) & FARTHEST_STEP)
+        if plain:  # the brick's own plane decides, and the voxel's leap may go on farther
+            known = bool(level < 0.0)
+            if (level > 0.0) != (slope > 0.0) and slope != 0.0:
+                far = t + (abs(level) - 1.0) / abs(slope)
         elif byte < NO_SURFEL:
             surfel = int(tables.words[tables.bases + slot]) + byte
-    borders = size * (cell + lanes[at.SIGN : at.SIGN + 3, lane] * reach + lanes[at.BACK : at.BACK + 3, lane])
-    end = min(*(borders * lanes[at.INVERSE : at.INVERSE + 3, lane] + lanes[at.SHIFT : at.SHIFT + 3, lane]), near, stop)
+
+    def met(border: np.ndarray) -> float:
+        return float(min(border * lanes[at.INVERSE : at.INVERSE + 3, lane] + lanes[at.SHIFT : at.SHIFT + 3, lane]))
+
+    sign, back = lanes[at.SIGN : at.SIGN + 3, lane], lanes[at.BACK : at.BACK + 3, lane]
+    end = met(size * (cell + sign * reach + back))
+    if plain:
+        far = min(far, met(4 * (voxel // 4 + sign + back)))
+        end = max(end, far) if proven else far
+    end = min(end, stop)
     if surfel >= 0:
         gx, gy, gz, offset = tables.plane(tables.planes, surfel)
         x, y, z = place - voxel - 0.5

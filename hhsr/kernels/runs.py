@@ -1,0 +1,123 @@
+"""Runs: the stretches of a walk that no plane decides, kept as records, and how each is settled.
+
+A walk goes on behind a run without its crossings, for the planes prove the state there. So the runs of many segments
+can be settled in the order of the tables that they need. What is pending is the record after the last one.
+"""
+
+import math
+
+import numpy as np
+
+from hhsr.kernels.chart_walk import follow_cells
+from hhsr.kernels.clipped import follow_tree, merge_touches
+from hhsr.kernels.lane import END, FIRST_RUN, FOUND, LAST_RUN, RUNS_USED, SPILLED, START
+from hhsr.kernels.layout import FRAME, OWNER_INT_SIZE, OWNER_INTS, OWNER_RECORD, ROTATED
+from hhsr.kernels.stretch import change, root_in
+from hhsr.kernels.tree import into_leaf, turn_into_leaf
+from hhsr.kernels.unmanaged import inlined, unmanaged
+
+# Kinds of runs: none; F is proven monotone; one leaf's; anybody's; no stretch, but a change at one place.
+NONE, MONOTONE, OWN, CLIPPED, POINT = 0, 1, 2, 3, 4
+# A record: kind + 8·(state before) + 16·(state after) + 32·key, −1 where its crossings were too many; t where it begins
+# and ends; t where F is about 1; the least and greatest |dF/dt|; |d²F/dt²|; the sign of dF/dt; its owner; the segment's
+# start and end (tree's frame, mm); the number of the segment's next record, −1 of its last. Once settled it begins with
+# the place of its crossings and ends with their number.
+CODE, RUN_BEGIN, RUN_END, GUESS, LEAST, MOST, RUN_BEND, RISE, OWNER = 0, 1, 2, 3, 4, 5, 6, 7, 8
+RUN_FROM, RUN_TO, NEXT, RUN_SIZE = 9, 12, 15, 16
+BEFORE, AFTER, KEY = 8, 16, 32  # in the code
+KEY_SHIFT = 4  # surfels of a key, as a power of two
+
+
+@inlined
+def enter(kind, runs, lanes, a, b, owner, slope, stray, bend, guess):
+    """Add [a, b] of a voxel to the pending run, or begin one; return its kind. Owner −1: a voxel without a surfel."""
+    run = int(lanes[RUNS_USED, 0])
+    new = CLIPPED if owner < 0 else (MONOTONE if abs(slope) > stray else OWN)
+    if kind == NONE:
+        runs[run, RUN_BEGIN], runs[run, OWNER], runs[run, RISE] = a, owner, slope
+        runs[run, LEAST], runs[run, MOST] = abs(slope) - stray, abs(slope) + stray
+        runs[run, RUN_BEND], runs[run, GUESS] = bend, guess
+        return new
+    if kind == CLIPPED or new == CLIPPED or runs[run, OWNER] != owner:
+        return CLIPPED
+    runs[run, RUN_BEND] = max(runs[run, RUN_BEND], bend)
+    if kind == MONOTONE and new == MONOTONE and (runs[run, RISE] > 0.0) == (slope > 0.0):
+        runs[run, LEAST] = min(runs[run, LEAST], abs(slope) - stray)
+        runs[run, MOST] = max(runs[run, MOST], abs(slope) + stray)
+        if guess >= a:  # the plane of this voxel is the one that the crossing lies on, or past
+            runs[run, GUESS] = guess
+        return MONOTONE
+    return OWN
+
+
+@inlined
+def close(kind, runs, lanes, lane, state, new, end, surfel):
+    """End the pending run of a lane at t = `end` in the state `new`; a monotone one between like states is dropped.
+
+    surfel: one of those it passes (else −1): neighbours have neighbouring numbers.
+    """
+    if kind == MONOTONE and state == new:
+        return
+    run = int(lanes[RUNS_USED, 0])
+    if run + 1 >= runs.shape[0]:  # the next one needs a record to be pending in
+        lanes[SPILLED, lane] = 1.0
+        return
+    key = max(surfel, np.int64(0)) >> KEY_SHIFT
+    runs[run, CODE] = kind + (BEFORE if state else 0) + (AFTER if new else 0) + KEY * key
+    runs[run, RUN_END], runs[run, NEXT] = end, -1.0
+    for k in range(3):
+        runs[run, RUN_FROM + k], runs[run, RUN_TO + k] = lanes[START + k, lane], lanes[END + k, lane]
+    last = int(lanes[LAST_RUN, lane])
+    if last < 0:
+        lanes[FIRST_RUN, lane] = run
+    else:
+        runs[last, NEXT] = run
+    lanes[LAST_RUN, lane], lanes[RUNS_USED, 0] = run, run + 1
+    if state != new:
+        lanes[FOUND, lane] = min(lanes[FOUND, lane], end)
+
+
+@inlined
+def note(runs, lanes, lane, state, new, t):
+    """Keep a change of state at t, if it is one."""
+    if state != new:
+        runs[int(lanes[RUNS_USED, 0]), RUN_BEGIN] = t
+        close(np.int64(POINT), runs, lanes, lane, state, new, t, np.int64(-1))
+
+
+@unmanaged
+def settle_run(blob, ints, tab, runs, run, resolution, tolerance, gap, out, count, work, slots, pending):
+    """Add the crossings of a run to out (k,), `count` being there; return how many there are then.
+
+    gap: of t, below which a leaving and an entering are one touch.
+    """
+    code = int(runs[run, CODE])
+    kind, state, new = code & 7, code & BEFORE != 0, code & AFTER != 0
+    begin, end = runs[run, RUN_BEGIN], runs[run, RUN_END]
+    if kind == POINT:
+        return change(state, new, begin, gap, out, count)[1]
+    px, py, pz = runs[run, RUN_FROM], runs[run, RUN_FROM + 1], runs[run, RUN_FROM + 2]
+    dx, dy, dz = runs[run, RUN_TO] - px, runs[run, RUN_TO + 1] - py, runs[run, RUN_TO + 2] - pz
+    if kind == CLIPPED:
+        state, count, _ = follow_tree(
+            blob, ints, tab, np.int64(0), px, py, pz, dx, dy, dz, begin, end, gap, resolution, tolerance,
+            np.bool_(False), state, out, count, work, slots, pending,
+        )  # fmt: skip
+        state, count = change(state, new, end, gap, out, count)
+        return merge_touches(out, count, gap)
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * int(runs[run, OWNER]) + OWNER_RECORD]
+    px, py, pz = into_leaf(blob, ints, leaf, px, py, pz)
+    if ints[leaf + ROTATED] != 0:
+        dx, dy, dz = turn_into_leaf(blob, ints[leaf + FRAME], dx, dy, dz)
+    if kind == MONOTONE:
+        end = root_in(
+            blob, ints, leaf, px, py, pz, dx, dy, dz, begin, end, runs[run, GUESS], runs[run, RISE] > 0.0,
+            runs[run, LEAST], runs[run, MOST], runs[run, RUN_BEND], tolerance / length,
+        )  # fmt: skip
+    else:
+        state, count = follow_cells(
+            blob, ints, tab, leaf, px, py, pz, dx, dy, dz, length, begin, end, resolution, tolerance, gap, state, out,
+            count, work,
+        )  # fmt: skip
+    return change(state, new, end, gap, out, count)[1]
