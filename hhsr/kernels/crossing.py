@@ -11,7 +11,7 @@ from numba import njit
 from hhsr.kernels.clipped import follow_tree, merge_touches
 from hhsr.kernels.lane import BEGIN, FIRST_RUN, GAP, LAST_RUN, MERGE, ROWS, RUNS_USED, SPILLED, set_out
 from hhsr.kernels.layout import VOXELS, integers, tables
-from hhsr.kernels.runs import RUN_SIZE, settle_run
+from hhsr.kernels.runs import CODE, MONOTONE, RUN_SIZE, make_ready, settle_run
 from hhsr.kernels.segment import PIECES, emit
 from hhsr.kernels.tree import into_tree
 from hhsr.kernels.unmanaged import unmanaged
@@ -49,6 +49,8 @@ def _walk(
         if lanes[SPILLED, 0] > 0.0:
             return False, np.int64(-1)
         for run in range(int(lanes[RUNS_USED, 0])):
+            if int(runs[run, CODE]) & 7 == MONOTONE:
+                make_ready(blob, ints, runs, np.int64(run))
             count = settle_run(
                 blob, ints, tab, runs, np.int64(run), resolution, tolerance, gap, out, count, work, slots, pending
             )

@@ -11,6 +11,7 @@ import math
 import numpy as np
 from numba import config, njit
 
+from hhsr.kernels.along import ALONG_ROWS
 from hhsr.kernels.crossing import scratch
 from hhsr.kernels.lane import (
     BEGIN,
@@ -18,7 +19,6 @@ from hhsr.kernels.lane import (
     FOUND,
     GAP,
     LEFT_AT,
-    MERGE,
     ROWS,
     RUNS_USED,
     SEGMENT,
@@ -28,8 +28,24 @@ from hhsr.kernels.lane import (
     T,
     set_out,
 )
-from hhsr.kernels.layout import VOXELS, integers, tables
-from hhsr.kernels.runs import CODE, KEY, KEY_SHIFT, NEXT, RUN_BEGIN, RUN_END, RUN_FROM, RUN_SIZE, RUN_TO, settle_run
+from hhsr.kernels.layout import BLOCKS_PER_SIDE, OWNER_COUNT, VOXELS, integers, tables
+from hhsr.kernels.runs import (
+    CODE,
+    KEY_SHIFT,
+    MONOTONE,
+    NEXT,
+    OWNER,
+    RUN_BEGIN,
+    RUN_BEND,
+    RUN_END,
+    RUN_GAP,
+    RUN_SIZE,
+    key_of,
+    make_ready,
+    owner_of,
+    settle_run,
+    settle_together,
+)
 from hhsr.kernels.segment import PIECES
 from hhsr.kernels.stride import stride
 from hhsr.kernels.surfel import PLANE_SIZE
@@ -46,6 +62,7 @@ ROOM = 64  # crossings of one run
 # gigabytes, or with JIT off.
 NOT_FINITE, MANY = -1, -2
 ROW, LIVE = 0, 1
+BLOCKS_OF_A_LEAF = 6 * BLOCKS_PER_SIDE * BLOCKS_PER_SIDE
 # Of a blob: strides count its bytes in 32 bits; interpreted there are none.
 MOST_SLOTS = 0 if config.DISABLE_JIT else 2**28  # type: ignore[attr-defined]
 
@@ -132,46 +149,83 @@ def _side_by_side(blob, ints, tab, starts, ends, stop, first, counts, begins, pl
 
 
 @unmanaged
-def most_keys(ints):
-    """Return how many keys of runs there are at most: one for each 2^KEY_SHIFT surfels."""
-    if ints[VOXELS] == 0:
-        return 1
-    record = ints[VOXELS]
-    return ((ints[record + DETAILS] - ints[record + PLANES]) // PLANE_SIZE >> KEY_SHIFT) + 1
-
-
-@inlined
-def _key(runs, run):
-    return int(runs[run, CODE]) // KEY
+def _blocks(ints):
+    """Return how many blocks of directions all owners have together: keys of runs that are ready."""
+    return ints[OWNER_COUNT] * BLOCKS_OF_A_LEAF
 
 
 @unmanaged
-def _order_runs(runs, used, bins, order):
-    """Fill order (used,) with the numbers of runs by their keys. bins: more than there are keys; scratch."""
+def _most_keys(ints):
+    """Return how many keys of runs there are: one for each block of directions, one for each 2^KEY_SHIFT surfels."""
+    if ints[VOXELS] == 0:
+        return 1
+    record = ints[VOXELS]
+    return _blocks(ints) + ((ints[record + DETAILS] - ints[record + PLANES]) // PLANE_SIZE >> KEY_SHIFT) + 1
+
+
+@inlined
+def _is_monotone(runs, run):
+    return int(runs[run, CODE]) & 7 == MONOTONE
+
+
+@inlined
+def _key(runs, run, blocks):
+    key = key_of(runs, run)
+    return BLOCKS_OF_A_LEAF * owner_of(runs, run) + key if _is_monotone(runs, run) else blocks + key
+
+
+@unmanaged
+def _order_runs(blob, ints, runs, used, bins, order):
+    """Fill order (used,) with the numbers of runs by their keys, and make them ready. bins: (_most_keys,) scratch."""
+    blocks, total = _blocks(ints), 0
     bins[:] = 0
     for run in range(used):
-        bins[_key(runs, run)] += 1
-    total = 0
+        if _is_monotone(runs, run):
+            make_ready(blob, ints, runs, np.int64(run))
+        bins[_key(runs, run, blocks)] += 1
     for key in range(bins.shape[0]):
         total, bins[key] = total + bins[key], total
     for run in range(used):
-        key = _key(runs, run)
+        key = _key(runs, run, blocks)
         order[bins[key]] = run
         bins[key] += 1
 
 
+@inlined
+def _together(runs, order, k, used):
+    """Return how many monotone runs, at most LANES, share the key of order[k]; 0 where that is none to be so settled."""
+    run = order[k]
+    if not (_is_monotone(runs, run) and runs[run, RUN_BEND] < math.inf):
+        return 0
+    m = 1
+    while m < LANES and k + m < used:
+        other = order[k + m]
+        if not (runs[other, OWNER] == runs[run, OWNER] and _is_monotone(runs, other)):
+            break
+        if not runs[other, RUN_BEND] < math.inf:
+            break
+        m += 1
+    return m
+
+
 @unmanaged
-def _settle(blob, ints, tab, runs, order, used, begun, resolution, tolerance, found, work, slots, pending):
+def _settle(blob, ints, tab, runs, order, used, begun, resolution, tolerance, found, rows, work, slots, pending):
     """Settle runs in their order: each one's crossings go to `found`, unmerged; return False where that has no room.
 
     begun: (2,) how many runs are settled, slots of found used; 0 to begin with, and as they were left to go on.
     """
-    place = begun[1]
-    for k in range(begun[0], used):
-        run = np.int64(order[k])
+    k, place = begun[0], begun[1]
+    while k < used:
         if place + ROOM > found.shape[0]:
             begun[0], begun[1] = k, place
             return False
+        m = _together(runs, order, k, used)
+        if m > 0:
+            settle_together(blob, ints, runs, order, k, m, tolerance, rows, found, place)
+            k, place = k + m, place + m
+            continue
+        run = np.int64(order[k])
+        k += 1
         count = settle_run(
             blob, ints, tab, runs, run, resolution, tolerance, -np.inf, found[place : place + ROOM], np.int64(0), work,
             slots, pending,
@@ -181,7 +235,7 @@ def _settle(blob, ints, tab, runs, order, used, begun, resolution, tolerance, fo
             continue
         runs[run, RUN_BEGIN], runs[run, RUN_END] = place, count
         place += count
-    begun[0], begun[1] = used, place
+    begun[0], begun[1] = k, place
     return True
 
 
@@ -196,9 +250,7 @@ def _gather(runs, found, first, row, stop, counts, places, ts, used):
         places[i] = used
         if counts[i] < 0 or run < 0:
             continue
-        dx, dy, dz = runs[run, RUN_TO] - runs[run, RUN_FROM], runs[run, RUN_TO + 1] - runs[run, RUN_FROM + 1], 0.0
-        dz = runs[run, RUN_TO + 2] - runs[run, RUN_FROM + 2]
-        gap = MERGE * (1.0 / math.sqrt(dx * dx + dy * dy + dz * dz))
+        gap = runs[run, RUN_GAP]
         base = used
         while run >= 0:
             if runs[run, CODE] < 0.0:
@@ -238,7 +290,8 @@ def cross_many(blob, starts, ends, first, resolution, tolerance, counts, begins,
     n = starts.shape[0]
     runs = np.empty((2 * min(n, TOGETHER) + 8 * SPARE, RUN_SIZE))
     found, ts, begun = np.empty(2 * ROOM), np.empty(ROOM + n), np.zeros(2, dtype=np.int64)
-    bins, used, row = np.empty(most_keys(ints), dtype=np.int32), 0, 0
+    rows = np.empty((ALONG_ROWS, LANES))
+    bins, used, row = np.empty(_most_keys(ints), dtype=np.int32), 0, 0
     while row < n:
         stop = min(row + TOGETHER, n)
         begun[ROW], begun[LIVE] = row, 0
@@ -247,10 +300,10 @@ def cross_many(blob, starts, ends, first, resolution, tolerance, counts, begins,
             runs = _longer(runs)
         kept = int(work[PIECES + RUNS_USED, 0])
         order = np.empty(kept, dtype=np.int32)
-        _order_runs(runs, kept, bins, order)
+        _order_runs(blob, ints, runs, kept, bins, order)
         begun[:] = 0
         while not _settle(
-            blob, ints, tab, runs, order, kept, begun, resolution, tolerance, found, work, slots, pending
+            blob, ints, tab, runs, order, kept, begun, resolution, tolerance, found, rows, work, slots, pending
         ):
             found = _longer(found)
         while used + begun[1] > ts.shape[0]:

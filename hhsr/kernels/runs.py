@@ -8,23 +8,36 @@ import math
 
 import numpy as np
 
+from hhsr.kernels.along import CHANGE, FIELD, TANGENT, UNIT, fields_along
+from hhsr.kernels.cell import block_of, face_of
 from hhsr.kernels.chart_walk import follow_cells
 from hhsr.kernels.clipped import follow_tree, merge_touches
-from hhsr.kernels.lane import END, FIRST_RUN, FOUND, LAST_RUN, RUNS_USED, SPILLED, START
-from hhsr.kernels.layout import FRAME, OWNER_INT_SIZE, OWNER_INTS, OWNER_RECORD, ROTATED
-from hhsr.kernels.stretch import change, root_in
+from hhsr.kernels.lane import END, FIRST_RUN, FOUND, GAP, LAST_RUN, MERGE, RUNS_USED, SPILLED, START
+from hhsr.kernels.layout import FRAME, HALF_AXES, OWNER_INT_SIZE, OWNER_INTS, OWNER_RECORD, ROTATED
+from hhsr.kernels.stretch import (
+    centres_of,
+    change,
+    excess_along,
+    excess_of,
+    ray_along,
+    root_by_values,
+    root_from,
+)
 from hhsr.kernels.tree import into_leaf, turn_into_leaf
 from hhsr.kernels.unmanaged import inlined, unmanaged
+from hhsr.kernels.vectors import LANES
 
 # Kinds of runs: none; F is proven monotone; one leaf's; anybody's; no stretch, but a change at one place.
 NONE, MONOTONE, OWN, CLIPPED, POINT = 0, 1, 2, 3, 4
-# A record: kind + 8·(state before) + 16·(state after) + 32·key, −1 where its crossings were too many; t where it begins
-# and ends; t where F is about 1; the least and greatest |dF/dt|; |d²F/dt²|; the sign of dF/dt; its owner; the segment's
-# start and end (tree's frame, mm); the number of the segment's next record, −1 of its last. Once settled it begins with
-# the place of its crossings and ends with their number.
-CODE, RUN_BEGIN, RUN_END, GUESS, LEAST, MOST, RUN_BEND, RISE, OWNER = 0, 1, 2, 3, 4, 5, 6, 7, 8
+# A record: kind + 8·(state before) + 16·(state after) + 32·(F rises), −1 where its crossings were too many; t where it
+# begins and ends; t where F is about 1; the least and greatest |dF/dt|; |d²F/dt²|; MERGE as a share of the segment
+# (while it is pending, the sign of dF/dt); its owner + OWNERS·key; the segment's start and end (tree's frame, mm), or,
+# of a monotone run that is ready, its start and vector in the leaf's frame; the number of the segment's next record, −1
+# of its last. Once settled it begins with the place of its crossings and ends with their number.
+CODE, RUN_BEGIN, RUN_END, GUESS, LEAST, MOST, RUN_BEND, RUN_GAP, OWNER = 0, 1, 2, 3, 4, 5, 6, 7, 8
 RUN_FROM, RUN_TO, NEXT, RUN_SIZE = 9, 12, 15, 16
-BEFORE, AFTER, KEY = 8, 16, 32  # in the code
+BEFORE, AFTER, RISES = 8, 16, 32  # in the code
+OWNERS = 65_536
 KEY_SHIFT = 4  # surfels of a key, as a power of two
 
 
@@ -34,14 +47,14 @@ def enter(kind, runs, lanes, a, b, owner, slope, stray, bend, guess):
     run = int(lanes[RUNS_USED, 0])
     new = CLIPPED if owner < 0 else (MONOTONE if abs(slope) > stray else OWN)
     if kind == NONE:
-        runs[run, RUN_BEGIN], runs[run, OWNER], runs[run, RISE] = a, owner, slope
+        runs[run, RUN_BEGIN], runs[run, OWNER], runs[run, RUN_GAP] = a, owner, slope
         runs[run, LEAST], runs[run, MOST] = abs(slope) - stray, abs(slope) + stray
         runs[run, RUN_BEND], runs[run, GUESS] = bend, guess
         return new
     if kind == CLIPPED or new == CLIPPED or runs[run, OWNER] != owner:
         return CLIPPED
     runs[run, RUN_BEND] = max(runs[run, RUN_BEND], bend)
-    if kind == MONOTONE and new == MONOTONE and (runs[run, RISE] > 0.0) == (slope > 0.0):
+    if kind == MONOTONE and new == MONOTONE and (runs[run, RUN_GAP] > 0.0) == (slope > 0.0):
         runs[run, LEAST] = min(runs[run, LEAST], abs(slope) - stray)
         runs[run, MOST] = max(runs[run, MOST], abs(slope) + stray)
         if guess >= a:  # the plane of this voxel is the one that the crossing lies on, or past
@@ -62,8 +75,11 @@ def close(kind, runs, lanes, lane, state, new, end, surfel):
     if run + 1 >= runs.shape[0]:  # the next one needs a record to be pending in
         lanes[SPILLED, lane] = 1.0
         return
-    key = max(surfel, np.int64(0)) >> KEY_SHIFT
-    runs[run, CODE] = kind + (BEFORE if state else 0) + (AFTER if new else 0) + KEY * key
+    rises = kind == MONOTONE and runs[run, RUN_GAP] > 0.0
+    runs[run, CODE] = kind + (BEFORE if state else 0) + (AFTER if new else 0) + (RISES if rises else 0)
+    owner = max(runs[run, OWNER], 0.0) if kind != POINT else 0.0
+    runs[run, OWNER] = owner + OWNERS * (max(surfel, np.int64(0)) >> KEY_SHIFT)
+    runs[run, RUN_GAP] = lanes[GAP, lane]
     runs[run, RUN_END], runs[run, NEXT] = end, -1.0
     for k in range(3):
         runs[run, RUN_FROM + k], runs[run, RUN_TO + k] = lanes[START + k, lane], lanes[END + k, lane]
@@ -85,17 +101,110 @@ def note(runs, lanes, lane, state, new, t):
         close(np.int64(POINT), runs, lanes, lane, state, new, t, np.int64(-1))
 
 
+@inlined
+def owner_of(runs, run):
+    return int(runs[run, OWNER]) & (OWNERS - 1)
+
+
+@inlined
+def key_of(runs, run):
+    """Return the key of a run: of its surfels, or, of a ready one, its block of directions."""
+    return int(runs[run, OWNER]) // OWNERS
+
+
+@inlined
+def _leaf_of(ints, runs, run):
+    return ints[ints[OWNER_INTS] + OWNER_INT_SIZE * owner_of(runs, run) + OWNER_RECORD]
+
+
+@inlined
+def _first_guess(runs, run):
+    return min(max(runs[run, GUESS], runs[run, RUN_BEGIN]), runs[run, RUN_END])
+
+
+@unmanaged
+def make_ready(blob, ints, runs, run):
+    """Bring a monotone run into its leaf's frame; its key is the block of directions of the first guess from now on."""
+    leaf = _leaf_of(ints, runs, run)
+    px, py, pz = runs[run, RUN_FROM], runs[run, RUN_FROM + 1], runs[run, RUN_FROM + 2]
+    dx, dy, dz = runs[run, RUN_TO] - px, runs[run, RUN_TO + 1] - py, runs[run, RUN_TO + 2] - pz
+    px, py, pz = into_leaf(blob, ints, leaf, px, py, pz)
+    if ints[leaf + ROTATED] != 0:
+        dx, dy, dz = turn_into_leaf(blob, ints[leaf + FRAME], dx, dy, dz)
+    runs[run, RUN_FROM], runs[run, RUN_FROM + 1], runs[run, RUN_FROM + 2] = px, py, pz
+    runs[run, RUN_TO], runs[run, RUN_TO + 1], runs[run, RUN_TO + 2] = dx, dy, dz
+    t = _first_guess(runs, run)
+    face, a, b, _ = face_of(px + t * dx, py + t * dy, pz + t * dz)
+    runs[run, OWNER] = owner_of(runs, run) + OWNERS * block_of(face, a, b)
+
+
+@inlined
+def _root(blob, ints, runs, run, leaf, t, f, slope, tolerance):
+    """Return t of the crossing of a monotone run that is ready, from (F − 1, dF/dt) at t on. tolerance: mm."""
+    return root_from(
+        blob, ints, leaf, runs[run, RUN_FROM], runs[run, RUN_FROM + 1], runs[run, RUN_FROM + 2],
+        runs[run, RUN_TO], runs[run, RUN_TO + 1], runs[run, RUN_TO + 2], runs[run, RUN_BEGIN], runs[run, RUN_END],
+        t, f, slope, int(runs[run, CODE]) & RISES != 0, runs[run, LEAST], runs[run, RUN_BEND],
+        tolerance * (runs[run, RUN_GAP] / MERGE),
+    )  # fmt: skip
+
+
+@unmanaged
+def _settle_monotone(blob, ints, runs, run, tolerance):
+    """Return t of the crossing of a monotone run that is ready. tolerance: mm."""
+    leaf, t = _leaf_of(ints, runs, run), _first_guess(runs, run)
+    px, py, pz = runs[run, RUN_FROM], runs[run, RUN_FROM + 1], runs[run, RUN_FROM + 2]
+    dx, dy, dz = runs[run, RUN_TO], runs[run, RUN_TO + 1], runs[run, RUN_TO + 2]
+    if runs[run, RUN_BEND] < math.inf:
+        f, slope = excess_along(blob, ints, leaf, px + t * dx, py + t * dy, pz + t * dz, dx, dy, dz)
+        return _root(blob, ints, runs, run, leaf, t, f, slope, tolerance)
+    return root_by_values(
+        blob, ints, leaf, px, py, pz, dx, dy, dz, runs[run, RUN_BEGIN], runs[run, RUN_END], t,
+        int(runs[run, CODE]) & RISES != 0, runs[run, LEAST], runs[run, MOST], tolerance * (runs[run, RUN_GAP] / MERGE),
+    )  # fmt: skip
+
+
+@unmanaged
+def settle_together(blob, ints, runs, order, first, count, tolerance, rows, found, place):
+    """Settle `count` ≤ LANES monotone runs of one key, order[first] …, that are ready; their crossings go to `found`.
+
+    They are what `settle_run` finds, to the bit. rows: (ALONG_ROWS, LANES) scratch. tolerance: mm.
+    """
+    leaf, block = _leaf_of(ints, runs, order[first]), key_of(runs, order[first])
+    o, n = centres_of(ints, leaf, block)
+    for lane in range(LANES):
+        run = order[first + min(lane, count - 1)]
+        t, dx, dy, dz = _first_guess(runs, run), runs[run, RUN_TO], runs[run, RUN_TO + 1], runs[run, RUN_TO + 2]
+        x, y, z = runs[run, RUN_FROM] + t * dx, runs[run, RUN_FROM + 1] + t * dy, runs[run, RUN_FROM + 2] + t * dz
+        (
+            (rows[UNIT, lane], rows[UNIT + 1, lane], rows[UNIT + 2, lane]),
+            (rows[TANGENT, lane], rows[TANGENT + 1, lane], rows[TANGENT + 2, lane]),
+        ) = ray_along(x, y, z, dx, dy, dz)
+    fields_along(rows, blob, o, n)
+    for lane in range(count):
+        run = order[first + lane]
+        t, dx, dy, dz = _first_guess(runs, run), runs[run, RUN_TO], runs[run, RUN_TO + 1], runs[run, RUN_TO + 2]
+        x, y, z = runs[run, RUN_FROM] + t * dx, runs[run, RUN_FROM + 1] + t * dy, runs[run, RUN_FROM + 2] + t * dz
+        f, slope = excess_of(
+            blob, ints[leaf + HALF_AXES], x, y, z, dx, dy, dz, rows[FIELD, lane], rows[CHANGE, lane]
+        )
+        found[place + lane] = _root(blob, ints, runs, run, leaf, t, f, slope, tolerance)
+        runs[run, RUN_BEGIN], runs[run, RUN_END] = place + lane, 1.0
+
+
 @unmanaged
 def settle_run(blob, ints, tab, runs, run, resolution, tolerance, gap, out, count, work, slots, pending):
     """Add the crossings of a run to out (k,), `count` being there; return how many there are then.
 
-    gap: of t, below which a leaving and an entering are one touch.
+    A monotone run must be ready. gap: of t, below which a leaving and an entering are one touch.
     """
     code = int(runs[run, CODE])
     kind, state, new = code & 7, code & BEFORE != 0, code & AFTER != 0
     begin, end = runs[run, RUN_BEGIN], runs[run, RUN_END]
     if kind == POINT:
         return change(state, new, begin, gap, out, count)[1]
+    if kind == MONOTONE:
+        return change(state, new, _settle_monotone(blob, ints, runs, run, tolerance), gap, out, count)[1]
     px, py, pz = runs[run, RUN_FROM], runs[run, RUN_FROM + 1], runs[run, RUN_FROM + 2]
     dx, dy, dz = runs[run, RUN_TO] - px, runs[run, RUN_TO + 1] - py, runs[run, RUN_TO + 2] - pz
     if kind == CLIPPED:
@@ -106,18 +215,12 @@ def settle_run(blob, ints, tab, runs, run, resolution, tolerance, gap, out, coun
         state, count = change(state, new, end, gap, out, count)
         return merge_touches(out, count, gap)
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * int(runs[run, OWNER]) + OWNER_RECORD]
+    leaf = _leaf_of(ints, runs, run)
     px, py, pz = into_leaf(blob, ints, leaf, px, py, pz)
     if ints[leaf + ROTATED] != 0:
         dx, dy, dz = turn_into_leaf(blob, ints[leaf + FRAME], dx, dy, dz)
-    if kind == MONOTONE:
-        end = root_in(
-            blob, ints, leaf, px, py, pz, dx, dy, dz, begin, end, runs[run, GUESS], runs[run, RISE] > 0.0,
-            runs[run, LEAST], runs[run, MOST], runs[run, RUN_BEND], tolerance / length,
-        )  # fmt: skip
-    else:
-        state, count = follow_cells(
-            blob, ints, tab, leaf, px, py, pz, dx, dy, dz, length, begin, end, resolution, tolerance, gap, state, out,
-            count, work,
-        )  # fmt: skip
+    state, count = follow_cells(
+        blob, ints, tab, leaf, px, py, pz, dx, dy, dz, length, begin, end, resolution, tolerance, gap, state, out, count,
+        work,
+    )  # fmt: skip
     return change(state, new, end, gap, out, count)[1]

@@ -38,7 +38,7 @@ def scale_on_circle(cosine, sine, centres, inverse_extent, weights):
 
 # e^(−t/2) on [−1, 1]: Chebyshev interpolation of degree 11 (error 2.4e-16) in powers of t, from 40 digits. No call of
 # the C library stands in the loop then, and the compiler runs it four centres at a time.
-_POWERS = (
+POWERS = (
     0.9999999999999998,
     -0.49999999999999994,
     0.12500000000001799,
@@ -52,7 +52,7 @@ _POWERS = (
     2.70647493210243e-10,
     -1.229633898293371e-11,
 )
-_P0, _P1, _P2, _P3, _P4, _P5, _P6, _P7, _P8, _P9, _P10, _P11 = _POWERS
+_P0, _P1, _P2, _P3, _P4, _P5, _P6, _P7, _P8, _P9, _P10, _P11 = POWERS
 _MIDDLE = math.exp(-2.0)
 
 
@@ -137,22 +137,3 @@ def gaussian_bend(cm, ca, cb, inverse_extents, weights, um, ua, ub, q):
     bb -= q * (2.0 * first_b * ub + along * q * (1.0 - ub * ub))
     ab -= q * (first_b * ua + first_a * ub - along * q * ua * ub)
     return total, first_a, first_b, aa, ab, bb
-
-
-@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, forceinline=True)
-def gaussian_along(cx, cy, cz, inverse_extents, weights, ux, uy, uz, vx, vy, vz):
-    """Return (s, ds) of a unit direction u over rows of centres: its value, and its change along a tangent vector v."""
-    total = slope = 0.0
-    for j in range(weights.shape[0]):
-        h = min((1.0 - (ux * cx[j] + uy * cy[j] + uz * cz[j])) * inverse_extents[j], 1.0)
-        t = 2.0 * h - 1.0
-        t2 = t * t
-        t4 = t2 * t2
-        low = ((_P0 + _P1 * t) + (_P2 + _P3 * t) * t2) + ((_P4 + _P5 * t) + (_P6 + _P7 * t) * t2) * t4
-        root = low + ((_P8 + _P9 * t) + (_P10 + _P11 * t) * t2) * (t4 * t4)
-        quarter = root * root
-        rest = 1.0 - h
-        e = weights[j] * (quarter * quarter * _MIDDLE) * rest
-        total += e * rest
-        slope += e * inverse_extents[j] * (4.0 * rest + 2.0) * (vx * cx[j] + vy * cy[j] + vz * cz[j])
-    return total, slope

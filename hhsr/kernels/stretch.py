@@ -6,10 +6,10 @@ more than B·Δ²/2.
 
 import math
 
+from hhsr.kernels.along import field_along
 from hhsr.kernels.cell import axis_scale, block_of, face_of, norm_at, scale_in_block
 from hhsr.kernels.layout import BLOCK_DATA, BLOCK_ROWS, BLOCKS, HALF_AXES
 from hhsr.kernels.leaf import MAX_SCALE
-from hhsr.kernels.sphere_rbf import gaussian_along
 from hhsr.kernels.unmanaged import inlined, unmanaged
 
 
@@ -40,59 +40,55 @@ def excess(blob, ints, leaf, x, y, z):
 
 
 @inlined
-def excess_along(blob, ints, leaf, x, y, z, dx, dy, dz):
-    """Return (F − 1, ∂F/∂d) at a point of the frame of a leaf with an ellipsoid for a base, where nothing is capped."""
+def ray_along(x, y, z, dx, dy, dz):
+    """Return the unit direction (3,) of a point and what it changes by along d (3,)."""
     inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
     ux, uy, uz = x * inverse, y * inverse, z * inverse
-    face, a, b, _ = face_of(x, y, z)
-    start = ints[leaf + BLOCKS] + block_of(face, a, b)
-    o = ints[leaf + BLOCK_DATA] + ints[start]
-    n = (ints[start + 1] - ints[start]) // BLOCK_ROWS
     radial = dx * ux + dy * uy + dz * uz
-    s, ds = gaussian_along(
-        blob[o : o + n], blob[o + n : o + 2 * n], blob[o + 2 * n : o + 3 * n], blob[o + 3 * n : o + 4 * n],
-        blob[o + 4 * n : o + 5 * n], ux, uy, uz,
-        (dx - radial * ux) * inverse, (dy - radial * uy) * inverse, (dz - radial * uz) * inverse,
-    )  # fmt: skip
-    h = ints[leaf + HALF_AXES]
-    cx, cy, cz = axis_scale(blob, h, 0, x), axis_scale(blob, h, 2, y), axis_scale(blob, h, 4, z)
+    return (ux, uy, uz), ((dx - radial * ux) * inverse, (dy - radial * uy) * inverse, (dz - radial * uz) * inverse)
+
+
+@inlined
+def excess_of(blob, half_axes, x, y, z, dx, dy, dz, s, ds):
+    """Return (F − 1, ∂F/∂d) at a point where the scale field is s, and changes by ds along d."""
+    cx, cy, cz = axis_scale(blob, half_axes, 0, x), axis_scale(blob, half_axes, 2, y), axis_scale(blob, half_axes, 4, z)
     norm = math.sqrt(cx * x * x + cy * y * y + cz * z * z)
     d = 1.0 / (1.0 - s)
     f = norm * d
     return f - 1.0, ((cx * x * dx + cy * y * dy + cz * z * dz) / norm + f * ds) * d
 
 
-@unmanaged
-def root_in(blob, ints, leaf, px, py, pz, dx, dy, dz, lo, hi, guess, rises, least, most, bend, tolerance):
-    """Return t in [lo, hi] where F = 1 on p + t·d (leaf's frame), to the tolerance (of t).
+@inlined
+def centres_of(ints, leaf, block):
+    """Return (float slot, count) of the centres of a block of directions."""
+    start = ints[leaf + BLOCKS] + block
+    return ints[leaf + BLOCK_DATA] + ints[start], (ints[start + 1] - ints[start]) // BLOCK_ROWS
 
-    F is proven to cross 1 once there, rising or falling; least, most: bounds of |dF/dt|; bend: of |d²F/dt²|, infinite
-    where only values may be asked.
+
+@inlined
+def excess_along(blob, ints, leaf, x, y, z, dx, dy, dz):
+    """Return (F − 1, ∂F/∂d) at a point of the frame of a leaf with an ellipsoid for a base, where nothing is capped."""
+    face, a, b, _ = face_of(x, y, z)
+    o, n = centres_of(ints, leaf, block_of(face, a, b))
+    unit, way = ray_along(x, y, z, dx, dy, dz)
+    s, ds = field_along(blob, o, n, unit, way)
+    return excess_of(blob, ints[leaf + HALF_AXES], x, y, z, dx, dy, dz, s, ds)
+
+
+@unmanaged
+def root_from(blob, ints, leaf, px, py, pz, dx, dy, dz, lo, hi, t, f, slope, rises, least, bend, tolerance):
+    """Return t in [lo, hi] where F = 1 on p + t·d (leaf's frame), to the tolerance (of t), from (F − 1, dF/dt) at t on.
+
+    F is proven to cross 1 once there, rising or falling; least: a bound of |dF/dt|; bend: of |d²F/dt²|.
     """
-    smooth = bend < math.inf
-    mean, spread = 0.5 * (least + most), 0.5 * (most - least)
-    t = guess
     for turn in range(100):
-        t = min(max(t, lo), hi)
-        x, y, z = px + t * dx, py + t * dy, pz + t * dz
-        if smooth:
-            f, slope = excess_along(blob, ints, leaf, x, y, z, dx, dy, dz)
-            if not rises:
-                f, slope = -f, -slope
-            steep = max(slope - bend * (hi - lo), least, 1e-30)
-            far = abs(f) / steep
-            if 0.5 * bend * far * far <= tolerance * steep:
-                return min(max(t - f / max(slope, steep), lo), hi)
-            step = f / max(slope, steep)
-        else:
-            f = excess(blob, ints, leaf, x, y, z)
-            if not rises:
-                f = -f
-            if abs(f) <= least * tolerance:
-                return t
-            if abs(f) * spread <= tolerance * mean * least:
-                return min(max(t - f / mean, lo), hi)
-            step = f / mean
+        if not rises:
+            f, slope = -f, -slope
+        steep = max(slope - bend * (hi - lo), least, 1e-30)
+        far = abs(f) / steep
+        step = f / max(slope, steep)
+        if 0.5 * bend * far * far <= tolerance * steep:
+            return min(max(t - step, lo), hi)
         if f < 0.0:
             lo = t
         else:
@@ -100,6 +96,31 @@ def root_in(blob, ints, leaf, px, py, pz, dx, dy, dz, lo, hi, guess, rises, leas
         if hi - lo <= tolerance:
             break
         t -= step
+        if not lo < t < hi or turn % 3 == 2:
+            t = 0.5 * (lo + hi)
+        f, slope = excess_along(blob, ints, leaf, px + t * dx, py + t * dy, pz + t * dz, dx, dy, dz)
+    return 0.5 * (lo + hi)
+
+
+@unmanaged
+def root_by_values(blob, ints, leaf, px, py, pz, dx, dy, dz, lo, hi, t, rises, least, most, tolerance):
+    """Return the same where only values may be asked; most: a bound of |dF/dt| too."""
+    mean, spread = 0.5 * (least + most), 0.5 * (most - least)
+    for turn in range(100):
+        f = excess(blob, ints, leaf, px + t * dx, py + t * dy, pz + t * dz)
+        if not rises:
+            f = -f
+        if abs(f) <= least * tolerance:
+            return t
+        if abs(f) * spread <= tolerance * mean * least:
+            return min(max(t - f / mean, lo), hi)
+        if f < 0.0:
+            lo = t
+        else:
+            hi = t
+        if hi - lo <= tolerance:
+            break
+        t -= f / mean
         if not lo < t < hi or turn % 3 == 2:
             t = 0.5 * (lo + hi)
     return 0.5 * (lo + hi)

@@ -119,6 +119,20 @@ class Vector:
         return self.builder.zext(packed, LONG)
 
 
+def fused(factor: Vector, other: Vector | float, more: Vector | float) -> Vector:
+    """Return factor·other + more of doubles, rounded once."""
+    kind = factor.value.type
+    function = _intrinsic(factor.builder, f"llvm.fma.v{LANES}f64", kind, [kind] * 3)
+    return Vector(
+        factor.builder, factor.builder.call(function, [factor.value, factor._right(other), factor._right(more)])
+    )
+
+
+def _intrinsic(builder: Any, name: str, result: Any, kinds: list[Any]) -> Any:
+    """Return a function that LLVM knows by its name."""
+    return builder.module.globals.get(name) or ir.Function(builder.module, ir.FunctionType(result, kinds), name)
+
+
 def power_of_two(bits: Vector) -> Vector:
     """Return 2^bits of integers."""
     return Vector(bits.builder, bits.builder.shl(bits._right(1), bits.value))
@@ -168,9 +182,8 @@ def gather_four(builder: Any, table: Any, index: Vector) -> list[Vector]:
 
 def fetch_ahead(builder: Any, table: Any, index: Vector) -> None:
     """Ask for the table's elements at each lane's index, to be near when they are read: no read waits for them."""
-    name, byte = "llvm.prefetch.p0", ir.IntType(8).as_pointer()
-    kind = ir.FunctionType(ir.VoidType(), [byte, INT, INT, INT])
-    function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
+    byte = ir.IntType(8).as_pointer()
+    function = _intrinsic(builder, "llvm.prefetch.p0", ir.VoidType(), [byte, INT, INT, INT])
     for k in range(LANES):
         at = builder.bitcast(_lane(builder, table, index, k), byte)
         builder.call(function, [at, ir.Constant(INT, 0), ir.Constant(INT, 3), ir.Constant(INT, 1)])
