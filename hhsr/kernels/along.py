@@ -89,8 +89,8 @@ def emit_field(builder: Any, blob: Any, first: Any, count: Any, unit: Sequence[A
     return _summed(builder, count, LANES, ir.Constant(DOUBLE, 0.0), add)
 
 
-def emit_fields(builder: Any, rows: Any, blob: Any, first: Any, count: Any) -> None:
-    """Emit (s, ds) of LANES directions at once, from their rows into their rows, one centre at a time."""
+def emit_fields(builder: Any, rows: Any, blob: Any, first: Any, count: Any, terms: Any) -> None:
+    """Emit (s, ds) of LANES directions at once, from their rows into their rows, by the first `terms` of the centres."""
     given = [load(builder, rows, (UNIT + k) * LANES) for k in range(6)]
 
     def add(number: Any, sums: list[Any]) -> list[Any]:
@@ -101,7 +101,7 @@ def emit_fields(builder: Any, rows: Any, blob: Any, first: Any, count: Any) -> N
         return [fused(e, rest, s).value, fused(f, g, ds).value]
 
     nothing = Vector.of(builder, ir.Constant(DOUBLE, 0.0)).value
-    for row, total in zip((FIELD, CHANGE), _summed(builder, count, 1, nothing, add), strict=True):
+    for row, total in zip((FIELD, CHANGE), _summed(builder, terms, 1, nothing, add), strict=True):
         store(builder, Vector(builder, total), rows, row * LANES)
 
 
@@ -121,9 +121,12 @@ def _field_along(typing: Any, blob: Any, first: Any, count: Any, unit: Any, way:
 
 
 @intrinsic
-def fields_along(typing: Any, rows: Any, blob: Any, first: Any, count: Any) -> Any:
-    """Fill rows FIELD and CHANGE of points side by side (ALONG_ROWS, LANES), over the centres of one block."""
-    signature = types.void(rows, blob, first, count)
+def fields_along(typing: Any, rows: Any, blob: Any, first: Any, count: Any, terms: Any) -> Any:
+    """Fill rows FIELD and CHANGE of points side by side (ALONG_ROWS, LANES), over the centres of one block.
+
+    first: their float slot, count: how many; terms: how many from the first on, for those behind have no weight.
+    """
+    signature = types.void(rows, blob, first, count, terms)
 
     def emit(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
         rows, blob = (

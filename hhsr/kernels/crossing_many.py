@@ -40,18 +40,18 @@ from hhsr.kernels.runs import (
     RUN_END,
     RUN_GAP,
     RUN_SIZE,
+    improve_together,
     key_of,
     make_ready,
     owner_of,
     settle_run,
-    settle_together,
 )
 from hhsr.kernels.segment import PIECES
 from hhsr.kernels.stride import stride
 from hhsr.kernels.surfel import PLANE_SIZE
 from hhsr.kernels.tree import into_tree
 from hhsr.kernels.unmanaged import inlined, unmanaged
-from hhsr.kernels.vectors import LANES, bits_set
+from hhsr.kernels.vectors import LANES, bits_set, lowest_bit
 from hhsr.kernels.voxels import BASES, BRICK_PLANES, BRICKS, BYTES, DETAILS, PLANES, solid_contains
 from hhsr.kernels.walk import SPARE, cross_voxel, go_on
 
@@ -62,6 +62,7 @@ ROOM = 64  # crossings of one run
 # gigabytes, or with JIT off.
 NOT_FINITE, MANY = -1, -2
 ROW, LIVE = 0, 1
+ALL_LANES = 2**LANES - 1
 BLOCKS_OF_A_LEAF = 6 * BLOCKS_PER_SIDE * BLOCKS_PER_SIDE
 # Of a blob: strides count its bytes in 32 bits; interpreted there are none.
 MOST_SLOTS = 0 if config.DISABLE_JIT else 2**28  # type: ignore[attr-defined]
@@ -129,9 +130,12 @@ def _side_by_side(blob, ints, tab, starts, ends, stop, first, counts, begins, pl
             going = bits_set(taken)
             if going == 0 or going <= live - WAITING:
                 break
-        for lane in range(LANES):
+        waiting = ALL_LANES & ~taken
+        while waiting != 0:
+            lane = lowest_bit(waiting)
+            waiting &= waiting - 1
             i = np.int64(lanes[SEGMENT, lane])
-            if (taken >> lane) & 1 or i < 0:
+            if i < 0:
                 continue
             if cross_voxel(ints, tab, lanes, np.int64(lane), runs):
                 if not (first and lanes[T, lane] > lanes[FOUND, lane] + lanes[GAP, lane]):
@@ -164,68 +168,68 @@ def _most_keys(ints):
 
 
 @inlined
-def _is_monotone(runs, run):
-    return int(runs[run, CODE]) & 7 == MONOTONE
+def _is_smooth(runs, run):
+    return int(runs[run, CODE]) & 7 == MONOTONE and runs[run, RUN_BEND] < math.inf
 
 
 @inlined
 def _key(runs, run, blocks):
     key = key_of(runs, run)
-    return BLOCKS_OF_A_LEAF * owner_of(runs, run) + key if _is_monotone(runs, run) else blocks + key
+    return BLOCKS_OF_A_LEAF * owner_of(runs, run) + key if _is_smooth(runs, run) else blocks + key
 
 
 @unmanaged
 def _order_runs(blob, ints, runs, used, bins, order):
-    """Fill order (used,) with the numbers of runs by their keys, and make them ready. bins: (_most_keys,) scratch."""
+    """Make runs ready and put their numbers in order: smooth ones by their blocks, then the others by their surfels.
+
+    order: (used,); bins: (_most_keys,) scratch. Returns how many are smooth: monotone, with a bend that is known.
+    """
     blocks, total = _blocks(ints), 0
     bins[:] = 0
     for run in range(used):
-        if _is_monotone(runs, run):
+        if int(runs[run, CODE]) & 7 == MONOTONE:
             make_ready(blob, ints, runs, np.int64(run))
         bins[_key(runs, run, blocks)] += 1
     for key in range(bins.shape[0]):
         total, bins[key] = total + bins[key], total
+    smooth = bins[blocks]
     for run in range(used):
         key = _key(runs, run, blocks)
         order[bins[key]] = run
         bins[key] += 1
-
-
-@inlined
-def _together(runs, order, k, used):
-    """Return how many monotone runs, at most LANES, share the key of order[k]; 0 where that is none to be so settled."""
-    run = order[k]
-    if not (_is_monotone(runs, run) and runs[run, RUN_BEND] < math.inf):
-        return 0
-    m = 1
-    while m < LANES and k + m < used:
-        other = order[k + m]
-        if not (runs[other, OWNER] == runs[run, OWNER] and _is_monotone(runs, other)):
-            break
-        if not runs[other, RUN_BEND] < math.inf:
-            break
-        m += 1
-    return m
+    return np.int64(smooth)
 
 
 @unmanaged
-def _settle(blob, ints, tab, runs, order, used, begun, resolution, tolerance, found, rows, work, slots, pending):
+def _settle_smooth(blob, ints, runs, order, smooth, tolerance, found, rows):
+    """Settle the smooth runs, some at a time, in rounds: what one leaves open is the next one's order.
+
+    found: (k,) with room for all their crossings.
+    """
+    place, todo = np.int64(0), smooth
+    while todo > 0:
+        k = left = np.int64(0)
+        while k < todo:
+            m = np.int64(1)
+            while m < LANES and k + m < todo and runs[order[k + m], OWNER] == runs[order[k], OWNER]:
+                m += 1
+            left, place = improve_together(blob, ints, runs, order, k, m, left, tolerance, rows, found, place)
+            k += m
+        todo = left
+
+
+@unmanaged
+def _settle(blob, ints, tab, runs, order, used, begun, resolution, tolerance, found, work, slots, pending):
     """Settle runs in their order: each one's crossings go to `found`, unmerged; return False where that has no room.
 
-    begun: (2,) how many runs are settled, slots of found used; 0 to begin with, and as they were left to go on.
+    begun: (2,) how many runs are settled, slots of found used; as they were left to go on.
     """
-    k, place = begun[0], begun[1]
-    while k < used:
+    place = begun[1]
+    for k in range(begun[0], used):
+        run = np.int64(order[k])
         if place + ROOM > found.shape[0]:
             begun[0], begun[1] = k, place
             return False
-        m = _together(runs, order, k, used)
-        if m > 0:
-            settle_together(blob, ints, runs, order, k, m, tolerance, rows, found, place)
-            k, place = k + m, place + m
-            continue
-        run = np.int64(order[k])
-        k += 1
         count = settle_run(
             blob, ints, tab, runs, run, resolution, tolerance, -np.inf, found[place : place + ROOM], np.int64(0), work,
             slots, pending,
@@ -235,7 +239,7 @@ def _settle(blob, ints, tab, runs, order, used, begun, resolution, tolerance, fo
             continue
         runs[run, RUN_BEGIN], runs[run, RUN_END] = place, count
         place += count
-    begun[0], begun[1] = k, place
+    begun[0], begun[1] = used, place
     return True
 
 
@@ -300,10 +304,13 @@ def cross_many(blob, starts, ends, first, resolution, tolerance, counts, begins,
             runs = _longer(runs)
         kept = int(work[PIECES + RUNS_USED, 0])
         order = np.empty(kept, dtype=np.int32)
-        _order_runs(blob, ints, runs, kept, bins, order)
-        begun[:] = 0
+        smooth = _order_runs(blob, ints, runs, kept, bins, order)
+        while smooth > found.shape[0]:
+            found = _longer(found)
+        _settle_smooth(blob, ints, runs, order, smooth, tolerance, found, rows)
+        begun[:] = smooth
         while not _settle(
-            blob, ints, tab, runs, order, kept, begun, resolution, tolerance, found, rows, work, slots, pending
+            blob, ints, tab, runs, order, kept, begun, resolution, tolerance, found, work, slots, pending
         ):
             found = _longer(found)
         while used + begun[1] > ts.shape[0]:

@@ -19,9 +19,9 @@ from hhsr.kernels.stretch import (
     change,
     excess_along,
     excess_of,
+    improve,
     ray_along,
     root_by_values,
-    root_from,
 )
 from hhsr.kernels.tree import into_leaf, turn_into_leaf
 from hhsr.kernels.unmanaged import inlined, unmanaged
@@ -117,14 +117,9 @@ def _leaf_of(ints, runs, run):
     return ints[ints[OWNER_INTS] + OWNER_INT_SIZE * owner_of(runs, run) + OWNER_RECORD]
 
 
-@inlined
-def _first_guess(runs, run):
-    return min(max(runs[run, GUESS], runs[run, RUN_BEGIN]), runs[run, RUN_END])
-
-
 @unmanaged
 def make_ready(blob, ints, runs, run):
-    """Bring a monotone run into its leaf's frame; its key is the block of directions of the first guess from now on."""
+    """Bring a monotone run into its leaf's frame: GUESS within it, MOST the number of its improvements, its key."""
     leaf = _leaf_of(ints, runs, run)
     px, py, pz = runs[run, RUN_FROM], runs[run, RUN_FROM + 1], runs[run, RUN_FROM + 2]
     dx, dy, dz = runs[run, RUN_TO] - px, runs[run, RUN_TO + 1] - py, runs[run, RUN_TO + 2] - pz
@@ -133,63 +128,89 @@ def make_ready(blob, ints, runs, run):
         dx, dy, dz = turn_into_leaf(blob, ints[leaf + FRAME], dx, dy, dz)
     runs[run, RUN_FROM], runs[run, RUN_FROM + 1], runs[run, RUN_FROM + 2] = px, py, pz
     runs[run, RUN_TO], runs[run, RUN_TO + 1], runs[run, RUN_TO + 2] = dx, dy, dz
-    t = _first_guess(runs, run)
-    face, a, b, _ = face_of(px + t * dx, py + t * dy, pz + t * dz)
+    runs[run, GUESS] = min(max(runs[run, GUESS], runs[run, RUN_BEGIN]), runs[run, RUN_END])
+    if runs[run, RUN_BEND] < math.inf:
+        runs[run, MOST] = 0.0
+    _set_key(runs, run)
+
+
+@inlined
+def _set_key(runs, run):
+    """Set a ready run's key: the block of directions in which the guess lies."""
+    x, y, z, _, _, _ = _place_of(runs, run)
+    face, a, b, _ = face_of(x, y, z)
     runs[run, OWNER] = owner_of(runs, run) + OWNERS * block_of(face, a, b)
 
 
 @inlined
-def _root(blob, ints, runs, run, leaf, t, f, slope, tolerance):
-    """Return t of the crossing of a monotone run that is ready, from (F − 1, dF/dt) at t on. tolerance: mm."""
-    return root_from(
-        blob, ints, leaf, runs[run, RUN_FROM], runs[run, RUN_FROM + 1], runs[run, RUN_FROM + 2],
-        runs[run, RUN_TO], runs[run, RUN_TO + 1], runs[run, RUN_TO + 2], runs[run, RUN_BEGIN], runs[run, RUN_END],
-        t, f, slope, int(runs[run, CODE]) & RISES != 0, runs[run, LEAST], runs[run, RUN_BEND],
+def _place_of(runs, run):
+    """Return the guess's place (leaf's frame) of a run that is ready, and its vector."""
+    t, dx, dy, dz = runs[run, GUESS], runs[run, RUN_TO], runs[run, RUN_TO + 1], runs[run, RUN_TO + 2]
+    x, y, z = runs[run, RUN_FROM] + t * dx, runs[run, RUN_FROM + 1] + t * dy, runs[run, RUN_FROM + 2] + t * dz
+    return x, y, z, dx, dy, dz
+
+
+@inlined
+def _improve_run(runs, run, f, slope, tolerance):
+    """Improve the guess of a monotone run, where (F − 1, dF/dt) are known; return whether it is the crossing."""
+    done, runs[run, RUN_BEGIN], runs[run, RUN_END], runs[run, GUESS] = improve(
+        int(runs[run, MOST]), runs[run, RUN_BEGIN], runs[run, RUN_END], runs[run, GUESS], f, slope,
+        int(runs[run, CODE]) & RISES != 0, runs[run, LEAST], runs[run, RUN_BEND],
         tolerance * (runs[run, RUN_GAP] / MERGE),
     )  # fmt: skip
+    runs[run, MOST] += 1.0
+    return done
 
 
 @unmanaged
 def _settle_monotone(blob, ints, runs, run, tolerance):
     """Return t of the crossing of a monotone run that is ready. tolerance: mm."""
-    leaf, t = _leaf_of(ints, runs, run), _first_guess(runs, run)
-    px, py, pz = runs[run, RUN_FROM], runs[run, RUN_FROM + 1], runs[run, RUN_FROM + 2]
-    dx, dy, dz = runs[run, RUN_TO], runs[run, RUN_TO + 1], runs[run, RUN_TO + 2]
-    if runs[run, RUN_BEND] < math.inf:
-        f, slope = excess_along(blob, ints, leaf, px + t * dx, py + t * dy, pz + t * dz, dx, dy, dz)
-        return _root(blob, ints, runs, run, leaf, t, f, slope, tolerance)
+    leaf = _leaf_of(ints, runs, run)
+    while runs[run, RUN_BEND] < math.inf:
+        x, y, z, dx, dy, dz = _place_of(runs, run)
+        f, slope = excess_along(blob, ints, leaf, x, y, z, dx, dy, dz)
+        if _improve_run(runs, run, f, slope, tolerance):
+            return runs[run, GUESS]
     return root_by_values(
-        blob, ints, leaf, px, py, pz, dx, dy, dz, runs[run, RUN_BEGIN], runs[run, RUN_END], t,
-        int(runs[run, CODE]) & RISES != 0, runs[run, LEAST], runs[run, MOST], tolerance * (runs[run, RUN_GAP] / MERGE),
+        blob, ints, leaf, runs[run, RUN_FROM], runs[run, RUN_FROM + 1], runs[run, RUN_FROM + 2],
+        runs[run, RUN_TO], runs[run, RUN_TO + 1], runs[run, RUN_TO + 2], runs[run, RUN_BEGIN], runs[run, RUN_END],
+        runs[run, GUESS], int(runs[run, CODE]) & RISES != 0, runs[run, LEAST], runs[run, MOST],
+        tolerance * (runs[run, RUN_GAP] / MERGE),
     )  # fmt: skip
 
 
 @unmanaged
-def settle_together(blob, ints, runs, order, first, count, tolerance, rows, found, place):
-    """Settle `count` ≤ LANES monotone runs of one key, order[first] …, that are ready; their crossings go to `found`.
+def improve_together(blob, ints, runs, order, first, count, left, tolerance, rows, found, place):
+    """Improve `count` ≤ LANES ready monotone runs of one key, order[first] …: what `settle_run` does, to the bit.
 
-    They are what `settle_run` finds, to the bit. rows: (ALONG_ROWS, LANES) scratch. tolerance: mm.
+    Those that are settled go to `found` from a place on; the others are put into order from `left` on. Returns
+    (left, place). rows: (ALONG_ROWS, LANES) scratch. tolerance: mm.
     """
     leaf, block = _leaf_of(ints, runs, order[first]), key_of(runs, order[first])
     o, n = centres_of(ints, leaf, block)
     for lane in range(LANES):
-        run = order[first + min(lane, count - 1)]
-        t, dx, dy, dz = _first_guess(runs, run), runs[run, RUN_TO], runs[run, RUN_TO + 1], runs[run, RUN_TO + 2]
-        x, y, z = runs[run, RUN_FROM] + t * dx, runs[run, RUN_FROM + 1] + t * dy, runs[run, RUN_FROM + 2] + t * dz
+        x, y, z, dx, dy, dz = _place_of(runs, order[first + min(lane, count - 1)])
         (
             (rows[UNIT, lane], rows[UNIT + 1, lane], rows[UNIT + 2, lane]),
             (rows[TANGENT, lane], rows[TANGENT + 1, lane], rows[TANGENT + 2, lane]),
         ) = ray_along(x, y, z, dx, dy, dz)
-    fields_along(rows, blob, o, n)
+    terms = n
+    while terms > 0 and blob[o + 4 * n + terms - 1] == 0.0:  # what fills up the last LANES
+        terms -= 1
+    fields_along(rows, blob, o, n, np.int64(terms))
     for lane in range(count):
         run = order[first + lane]
-        t, dx, dy, dz = _first_guess(runs, run), runs[run, RUN_TO], runs[run, RUN_TO + 1], runs[run, RUN_TO + 2]
-        x, y, z = runs[run, RUN_FROM] + t * dx, runs[run, RUN_FROM + 1] + t * dy, runs[run, RUN_FROM + 2] + t * dz
-        f, slope = excess_of(
-            blob, ints[leaf + HALF_AXES], x, y, z, dx, dy, dz, rows[FIELD, lane], rows[CHANGE, lane]
-        )
-        found[place + lane] = _root(blob, ints, runs, run, leaf, t, f, slope, tolerance)
-        runs[run, RUN_BEGIN], runs[run, RUN_END] = place + lane, 1.0
+        x, y, z, dx, dy, dz = _place_of(runs, run)
+        f, slope = excess_of(blob, ints[leaf + HALF_AXES], x, y, z, dx, dy, dz, rows[FIELD, lane], rows[CHANGE, lane])
+        if _improve_run(runs, run, f, slope, tolerance):
+            found[place] = runs[run, GUESS]
+            runs[run, RUN_BEGIN], runs[run, RUN_END] = place, 1.0
+            place += 1
+        else:
+            _set_key(runs, run)
+            order[left] = run
+            left += 1
+    return left, place
 
 
 @unmanaged

@@ -75,31 +75,30 @@ def excess_along(blob, ints, leaf, x, y, z, dx, dy, dz):
     return excess_of(blob, ints[leaf + HALF_AXES], x, y, z, dx, dy, dz, s, ds)
 
 
-@unmanaged
-def root_from(blob, ints, leaf, px, py, pz, dx, dy, dz, lo, hi, t, f, slope, rises, least, bend, tolerance):
-    """Return t in [lo, hi] where F = 1 on p + t·d (leaf's frame), to the tolerance (of t), from (F − 1, dF/dt) at t on.
+@inlined
+def improve(turn, lo, hi, t, f, slope, rises, least, bend, tolerance):
+    """Return (whether t is the place of the crossing, lo, hi, t) after (F − 1, dF/dt) is known at t in [lo, hi].
 
-    F is proven to cross 1 once there, rising or falling; least: a bound of |dF/dt|; bend: of |d²F/dt²|.
+    F is proven to cross 1 once there, rising or falling; least: a bound of |dF/dt|; bend: of |d²F/dt²|; tolerance: of
+    t. turn: how often it was improved before.
     """
-    for turn in range(100):
-        if not rises:
-            f, slope = -f, -slope
-        steep = max(slope - bend * (hi - lo), least, 1e-30)
-        far = abs(f) / steep
-        step = f / max(slope, steep)
-        if 0.5 * bend * far * far <= tolerance * steep:
-            return min(max(t - step, lo), hi)
-        if f < 0.0:
-            lo = t
-        else:
-            hi = t
-        if hi - lo <= tolerance:
-            break
-        t -= step
-        if not lo < t < hi or turn % 3 == 2:
-            t = 0.5 * (lo + hi)
-        f, slope = excess_along(blob, ints, leaf, px + t * dx, py + t * dy, pz + t * dz, dx, dy, dz)
-    return 0.5 * (lo + hi)
+    if not rises:
+        f, slope = -f, -slope
+    steep = max(slope - bend * (hi - lo), least, 1e-30)
+    far = abs(f) / steep
+    step = f / max(slope, steep)
+    if 0.5 * bend * far * far <= tolerance * steep:
+        return True, lo, hi, min(max(t - step, lo), hi)
+    if f < 0.0:
+        lo = t
+    else:
+        hi = t
+    if hi - lo <= tolerance:
+        return True, lo, hi, 0.5 * (lo + hi)
+    t -= step
+    if not lo < t < hi or turn % 3 == 2:
+        t = 0.5 * (lo + hi)
+    return turn >= 100, lo, hi, t
 
 
 @unmanaged

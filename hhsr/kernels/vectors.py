@@ -193,3 +193,13 @@ def fetch_ahead(builder: Any, table: Any, index: Vector) -> None:
 def bits_set(typing: Any, number: Any) -> Any:
     """Return how many bits of a number are set."""
     return types.int64(types.int64), lambda context, builder, signature, arguments: builder.ctpop(arguments[0])
+
+
+@intrinsic
+def lowest_bit(typing: Any, number: Any) -> Any:
+    """Return which bit of a number that is not 0 is the lowest that is set."""
+
+    def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.int64(types.int64), emit
