@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from threading import Lock, local
 from typing import Any
 
@@ -50,7 +51,30 @@ def in_parts(count: int, smallest: int, work: Callable[[int, int], Any]) -> list
         return [work(0, count)]
     parts = PARTS_PER_THREAD * threads
     edges = [count * k // parts for k in range(parts + 1)]
-    return list(_pool(threads).map(work, edges[:-1], edges[1:]))
+    results: list[Any] = [None] * parts
+    waiting = deque(range(parts))
+
+    def share() -> None:
+        while waiting:
+            try:
+                k = waiting.popleft()
+            except IndexError:  # another thread took the last one
+                return
+            results[k] = work(edges[k], edges[k + 1])
+
+    # The caller works too: to wake one thread and wait for it costs as much as some thousand points.
+    others = [_pool(threads - 1).submit(share) for _ in range(threads - 1)]
+    _THREAD.busy = True
+    try:
+        share()
+    finally:
+        _THREAD.busy = False
+        waiting.clear()
+        others = [other for other in others if not other.cancel()]  # one that is still in the queue is not waited for
+        wait(others)
+    for other in others:
+        other.result()
+    return results
 
 
 def neighbours_first(points: FloatArray) -> NDArray[np.int64]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hhsr.answers import Crossings
 from hhsr.batches import by_middles, in_parts, neighbours_first
 from hhsr.kernels.clearance import clearance_many
-from hhsr.kernels.crossing_many import place_all, place_counts, place_first
+from hhsr.kernels.crossing_places import place_all, place_counts, place_first
 from hhsr.kernels.distance import nearest_many
 from hhsr.model import FloatArray
 from hhsr.segments import cross_segments

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hhsr.kernels.crossing import cross_one
-from hhsr.kernels.crossing_many import MANY, ROOM, cross_many
+from hhsr.kernels.crossing_many import cross_many
+from hhsr.kernels.run_batch import MANY, ROOM
 from hhsr.model import FloatArray
 
 

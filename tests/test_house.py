@@ -24,7 +24,11 @@ def imported(path: Path) -> set[str]:
     return names
 
 
-EMITTERS = {"vectors.py", "stride.py"}  # these write the processor's vectors themselves (decision 0007)
+EMITTERS = {
+    "vectors.py",
+    "stride.py",
+    "along.py",
+}  # these write the processor's vectors themselves (decisions 0007, 0008)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "hhsr" / "kernels").glob("*.py")), ids=lambda p: p.name)

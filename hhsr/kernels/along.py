@@ -26,7 +26,6 @@ _P0, _P1, _P2, _P3, _P4, _P5, _P6, _P7, _P8, _P9, _P10, _P11 = POWERS
 _MIDDLE = math.exp(-2.0)
 
 
-
 def _terms(builder: Any, unit: Any, way: Any, centre: Sequence[Vector]) -> tuple[Vector, Vector, Vector, Vector]:
     """Return (e, rest, f, g) of centres (x, y, z, 1/(1 − cos σ), weight): e·rest adds to s, f·g to its change."""
     cx, cy, cz, inverse, weight = centre
@@ -90,7 +89,7 @@ def emit_field(builder: Any, blob: Any, first: Any, count: Any, unit: Sequence[A
 
 
 def emit_fields(builder: Any, rows: Any, blob: Any, first: Any, count: Any, terms: Any) -> None:
-    """Emit (s, ds) of LANES directions at once, from their rows into their rows, by the first `terms` of the centres."""
+    """Emit (s, ds) of LANES directions at once, from rows into rows, by the first `terms` of the centres."""
     given = [load(builder, rows, (UNIT + k) * LANES) for k in range(6)]
 
     def add(number: Any, sums: list[Any]) -> list[Any]:
@@ -114,7 +113,7 @@ def _field_along(typing: Any, blob: Any, first: Any, count: Any, unit: Any, way:
         blob = context.make_array(signature.args[0])(context, builder, arguments[0]).data
         unit, way = ([builder.extract_value(value, k) for k in range(3)] for value in arguments[3:])
         return context.make_tuple(
-            builder, signature.return_type, emit_field(builder, blob, *arguments[1:3], unit, way)
+            builder, signature.return_type, emit_field(builder, blob, arguments[1], arguments[2], unit, way)
         )
 
     return signature, emit
@@ -151,8 +150,8 @@ else:
 
     @unmanaged
     def field_along(blob, first, count, unit, way):
-        """Return (s, ds) of a unit direction (3,) over a block's `count` centres at a float slot: value, change along way.
+        """Return (s, ds) of a unit direction (3,): the scale field and its change along a tangent, way (3,).
 
-        A multiple of LANES of centres; way: (3,) tangent.
+        first: float slot of the block's centres, count: how many, a multiple of LANES.
         """
         return _field_along(blob, np.int64(first), np.int64(count), unit, way)

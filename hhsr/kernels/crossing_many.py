@@ -28,27 +28,20 @@ from hhsr.kernels.lane import (
     T,
     set_out,
 )
-from hhsr.kernels.layout import BLOCKS_PER_SIDE, OWNER_COUNT, VOXELS, integers, tables
-from hhsr.kernels.runs import (
-    CODE,
-    KEY_SHIFT,
-    MONOTONE,
-    NEXT,
-    OWNER,
-    RUN_BEGIN,
-    RUN_BEND,
-    RUN_END,
-    RUN_GAP,
-    RUN_SIZE,
-    improve_together,
-    key_of,
-    make_ready,
-    owner_of,
-    settle_run,
+from hhsr.kernels.layout import VOXELS, integers, tables
+from hhsr.kernels.run_batch import (
+    MANY,
+    NOT_FINITE,
+    ROOM,
+    gather_crossings,
+    most_keys,
+    order_runs,
+    settle_others,
+    settle_smooth,
 )
+from hhsr.kernels.runs import RUN_SIZE
 from hhsr.kernels.segment import PIECES
 from hhsr.kernels.stride import stride
-from hhsr.kernels.surfel import PLANE_SIZE
 from hhsr.kernels.tree import into_tree
 from hhsr.kernels.unmanaged import inlined, unmanaged
 from hhsr.kernels.vectors import LANES, bits_set, lowest_bit
@@ -57,13 +50,8 @@ from hhsr.kernels.walk import SPARE, cross_voxel, go_on
 
 WAITING = 3  # so many lanes are without a stride when the others wait for them
 TOGETHER = 8_192  # segments whose runs are settled together
-ROOM = 64  # crossings of one run
-# Instead of a count: a segment that is not finite; one that has no room here, of a solid without a grid, of one of
-# gigabytes, or with JIT off.
-NOT_FINITE, MANY = -1, -2
 ROW, LIVE = 0, 1
 ALL_LANES = 2**LANES - 1
-BLOCKS_OF_A_LEAF = 6 * BLOCKS_PER_SIDE * BLOCKS_PER_SIDE
 # Of a blob: strides count its bytes in 32 bits; interpreted there are none.
 MOST_SLOTS = 0 if config.DISABLE_JIT else 2**28  # type: ignore[attr-defined]
 
@@ -152,128 +140,6 @@ def _side_by_side(blob, ints, tab, starts, ends, stop, first, counts, begins, pl
     return True
 
 
-@unmanaged
-def _blocks(ints):
-    """Return how many blocks of directions all owners have together: keys of runs that are ready."""
-    return ints[OWNER_COUNT] * BLOCKS_OF_A_LEAF
-
-
-@unmanaged
-def _most_keys(ints):
-    """Return how many keys of runs there are: one for each block of directions, one for each 2^KEY_SHIFT surfels."""
-    if ints[VOXELS] == 0:
-        return 1
-    record = ints[VOXELS]
-    return _blocks(ints) + ((ints[record + DETAILS] - ints[record + PLANES]) // PLANE_SIZE >> KEY_SHIFT) + 1
-
-
-@inlined
-def _is_smooth(runs, run):
-    return int(runs[run, CODE]) & 7 == MONOTONE and runs[run, RUN_BEND] < math.inf
-
-
-@inlined
-def _key(runs, run, blocks):
-    key = key_of(runs, run)
-    return BLOCKS_OF_A_LEAF * owner_of(runs, run) + key if _is_smooth(runs, run) else blocks + key
-
-
-@unmanaged
-def _order_runs(blob, ints, runs, used, bins, order):
-    """Make runs ready and put their numbers in order: smooth ones by their blocks, then the others by their surfels.
-
-    order: (used,); bins: (_most_keys,) scratch. Returns how many are smooth: monotone, with a bend that is known.
-    """
-    blocks, total = _blocks(ints), 0
-    bins[:] = 0
-    for run in range(used):
-        if int(runs[run, CODE]) & 7 == MONOTONE:
-            make_ready(blob, ints, runs, np.int64(run))
-        bins[_key(runs, run, blocks)] += 1
-    for key in range(bins.shape[0]):
-        total, bins[key] = total + bins[key], total
-    smooth = bins[blocks]
-    for run in range(used):
-        key = _key(runs, run, blocks)
-        order[bins[key]] = run
-        bins[key] += 1
-    return np.int64(smooth)
-
-
-@unmanaged
-def _settle_smooth(blob, ints, runs, order, smooth, tolerance, found, rows):
-    """Settle the smooth runs, some at a time, in rounds: what one leaves open is the next one's order.
-
-    found: (k,) with room for all their crossings.
-    """
-    place, todo = np.int64(0), smooth
-    while todo > 0:
-        k = left = np.int64(0)
-        while k < todo:
-            m = np.int64(1)
-            while m < LANES and k + m < todo and runs[order[k + m], OWNER] == runs[order[k], OWNER]:
-                m += 1
-            left, place = improve_together(blob, ints, runs, order, k, m, left, tolerance, rows, found, place)
-            k += m
-        todo = left
-
-
-@unmanaged
-def _settle(blob, ints, tab, runs, order, used, begun, resolution, tolerance, found, work, slots, pending):
-    """Settle runs in their order: each one's crossings go to `found`, unmerged; return False where that has no room.
-
-    begun: (2,) how many runs are settled, slots of found used; as they were left to go on.
-    """
-    place = begun[1]
-    for k in range(begun[0], used):
-        run = np.int64(order[k])
-        if place + ROOM > found.shape[0]:
-            begun[0], begun[1] = k, place
-            return False
-        count = settle_run(
-            blob, ints, tab, runs, run, resolution, tolerance, -np.inf, found[place : place + ROOM], np.int64(0), work,
-            slots, pending,
-        )  # fmt: skip
-        if count > ROOM:
-            runs[run, CODE] = -1.0
-            continue
-        runs[run, RUN_BEGIN], runs[run, RUN_END] = place, count
-        place += count
-    begun[0], begun[1] = used, place
-    return True
-
-
-@unmanaged
-def _gather(runs, found, first, row, stop, counts, places, ts, used):
-    """Put the crossings of segments row … stop, whose runs are settled, into ts from `used` on; return how many slots.
-
-    counts, places: of each, from the place of its first run. A leaving and an entering that touch are dropped.
-    """
-    for i in range(row, stop):
-        run = places[i]
-        places[i] = used
-        if counts[i] < 0 or run < 0:
-            continue
-        gap = runs[run, RUN_GAP]
-        base = used
-        while run >= 0:
-            if runs[run, CODE] < 0.0:
-                counts[i], used = MANY, base
-                break
-            place = int(runs[run, RUN_BEGIN])
-            for k in range(place, place + int(runs[run, RUN_END])):
-                if used > base and found[k] - ts[used - 1] <= gap:
-                    used -= 1
-                else:
-                    ts[used] = found[k]
-                    used += 1
-            run = int(runs[run, NEXT])
-        if counts[i] >= 0:
-            used = min(used, base + 1) if first else used
-            counts[i] = used - base
-    return used
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _longer(table):
     """Return a table with as much room again, and more, behind its rows."""
@@ -295,7 +161,7 @@ def cross_many(blob, starts, ends, first, resolution, tolerance, counts, begins,
     runs = np.empty((2 * min(n, TOGETHER) + 8 * SPARE, RUN_SIZE))
     found, ts, begun = np.empty(2 * ROOM), np.empty(ROOM + n), np.zeros(2, dtype=np.int64)
     rows = np.empty((ALONG_ROWS, LANES))
-    bins, used, row = np.empty(_most_keys(ints), dtype=np.int32), 0, 0
+    bins, used, row = np.empty(most_keys(ints), dtype=np.int32), 0, 0
     while row < n:
         stop = min(row + TOGETHER, n)
         begun[ROW], begun[LIVE] = row, 0
@@ -304,53 +170,17 @@ def cross_many(blob, starts, ends, first, resolution, tolerance, counts, begins,
             runs = _longer(runs)
         kept = int(work[PIECES + RUNS_USED, 0])
         order = np.empty(kept, dtype=np.int32)
-        smooth = _order_runs(blob, ints, runs, kept, bins, order)
+        smooth = order_runs(blob, ints, runs, kept, bins, order)
         while smooth > found.shape[0]:
             found = _longer(found)
-        _settle_smooth(blob, ints, runs, order, smooth, tolerance, found, rows)
+        settle_smooth(blob, ints, runs, order, smooth, tolerance, found, rows)
         begun[:] = smooth
-        while not _settle(
+        while not settle_others(
             blob, ints, tab, runs, order, kept, begun, resolution, tolerance, found, work, slots, pending
         ):
             found = _longer(found)
         while used + begun[1] > ts.shape[0]:
             ts = _longer(ts)
-        used = _gather(runs, found, first, row, stop, counts, places, ts, used)
+        used = gather_crossings(runs, found, first, row, stop, counts, places, ts, used)
         row = stop
     return ts[:used]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def place_first(order, counts, places, ts, out):
-    """Put the first crossings, as `cross_many` tells of them, into rows `order` of out: NaN none, −1 not finite.
-
-    Returns how many are not finite.
-    """
-    bad = 0
-    for i in range(order.shape[0]):
-        out[order[i]] = ts[places[i]] if counts[i] > 0 else (np.nan if counts[i] == 0 else -1.0)
-        bad += 1 if counts[i] < 0 else 0
-    return bad
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def place_counts(order, counts, valid, out):
-    """Put counts (k,), 0 where a segment is not finite, into rows `order` of out, and which are finite into valid."""
-    for i in range(order.shape[0]):
-        valid[order[i]], out[order[i]] = counts[i] >= 0, max(counts[i], 0)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def place_all(starts, ends, order, counts, begins, places, ts, offsets, t, points, entering):
-    """Fill t (m,), points (m, 3) and entering (m,) with what `cross_many` found of segments (n, 3) → (n, 3).
-
-    order: (n,) the row of the answers that each segment is for. offsets: where each row's crossings begin.
-    """
-    for i in range(starts.shape[0]):
-        inside = begins[i]
-        to = offsets[order[i]]
-        for k in range(counts[i]):
-            inside = not inside
-            t[to + k], entering[to + k] = ts[places[i] + k], inside
-            for c in range(3):
-                points[to + k, c] = starts[i, c] + ts[places[i] + k] * (ends[i, c] - starts[i, c])

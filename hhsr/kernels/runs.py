@@ -14,6 +14,7 @@ from hhsr.kernels.chart_walk import follow_cells
 from hhsr.kernels.clipped import follow_tree, merge_touches
 from hhsr.kernels.lane import END, FIRST_RUN, FOUND, GAP, LAST_RUN, MERGE, RUNS_USED, SPILLED, START
 from hhsr.kernels.layout import FRAME, HALF_AXES, OWNER_INT_SIZE, OWNER_INTS, OWNER_RECORD, ROTATED
+from hhsr.kernels.maps import cell_at
 from hhsr.kernels.stretch import (
     centres_of,
     change,
@@ -25,7 +26,7 @@ from hhsr.kernels.stretch import (
 )
 from hhsr.kernels.tree import into_leaf, turn_into_leaf
 from hhsr.kernels.unmanaged import inlined, unmanaged
-from hhsr.kernels.vectors import LANES
+from hhsr.kernels.vectors import LANES, fetch
 
 # Kinds of runs: none; F is proven monotone; one leaf's; anybody's; no stretch, but a change at one place.
 NONE, MONOTONE, OWN, CLIPPED, POINT = 0, 1, 2, 3, 4
@@ -214,6 +215,22 @@ def improve_together(blob, ints, runs, order, first, count, left, tolerance, row
 
 
 @unmanaged
+def ask_for_cells(blob, ints, tab, runs, run):
+    """Ask for the cells of the begin, the middle and the end of one leaf's run, to be near when it is settled."""
+    if int(runs[run, CODE]) & 7 != OWN:
+        return
+    leaf = _leaf_of(ints, runs, run)
+    px, py, pz = runs[run, RUN_FROM], runs[run, RUN_FROM + 1], runs[run, RUN_FROM + 2]
+    dx, dy, dz = runs[run, RUN_TO] - px, runs[run, RUN_TO + 1] - py, runs[run, RUN_TO + 2] - pz
+    for k in range(3):
+        t = runs[run, RUN_BEGIN] + 0.5 * k * (runs[run, RUN_END] - runs[run, RUN_BEGIN])
+        x, y, z = into_leaf(blob, ints, leaf, px + t * dx, py + t * dy, pz + t * dz)
+        face, a, b, _ = face_of(x, y, z)
+        o, _, _, _ = cell_at(ints, leaf, face, a, b)
+        fetch(tab, o)
+
+
+@unmanaged
 def settle_run(blob, ints, tab, runs, run, resolution, tolerance, gap, out, count, work, slots, pending):
     """Add the crossings of a run to out (k,), `count` being there; return how many there are then.
 
@@ -241,7 +258,7 @@ def settle_run(blob, ints, tab, runs, run, resolution, tolerance, gap, out, coun
     if ints[leaf + ROTATED] != 0:
         dx, dy, dz = turn_into_leaf(blob, ints[leaf + FRAME], dx, dy, dz)
     state, count = follow_cells(
-        blob, ints, tab, leaf, px, py, pz, dx, dy, dz, length, begin, end, resolution, tolerance, gap, state, out, count,
-        work,
+        blob, ints, tab, leaf, px, py, pz, dx, dy, dz, length, begin, end, resolution, tolerance, gap, state, out,
+        count, work,
     )  # fmt: skip
     return change(state, new, end, gap, out, count)[1]

@@ -77,16 +77,17 @@ def emit_stride(builder: Any, lanes: Any, words: Any, tab: Any, grid: Sequence[A
     step = (step >> ((inner & 15) * STEP_BITS)) & FARTHEST_STEP
     proven, byte_in = ~leaps & (byte > NO_SURFEL), byte < OUT_BYTE
     surfel = ~leaps & ~plain & (byte < NO_SURFEL)
-    number = gather(builder, words, bases + slot) + surfel.where(byte, 0)
+    # Where no surfel is asked the first one stands for it: what is not needed is not fetched from afar.
+    number = surfel.where(gather(builder, words, bases + slot) + byte, 0)
     reach = leaps.where(leaps_in.where(leap, (leap ^ 255) + 1), power_of_two(proven.where(step, 0)))
-    far_out, end = reach.doubles(), None
+    far_out, end = reach.doubles(), stop
     for k in (2, 1, 0):
         forth, back, once, shift = row(SIGN + k), row(BACK + k), row(INVERSE + k), row(SHIFT + k)
         border = leaps.where(voxel[k] >> 2, voxel[k]).doubles() + forth * far_out + back
         met = leaps.where(border * 4.0, border) * once + shift
-        end = met if end is None else met.least(end)
+        end = met.least(end)
         far = ((((voxel[k] >> 2).doubles() + forth + back) * 4.0) * once + shift).least(far)
-    end = plain.where(proven.where(end.most(far), far), end).least(stop)
+    end = plain.where(proven.where(end.most(far), far).least(stop), end)
     *normal, offset = gather_four(builder, tab, planes + (number << 2))
     depth = _linear(normal, [place[k] - voxel[k].doubles() - 0.5 for k in range(3)]) + offset
     slope = _linear(normal, way)

@@ -151,9 +151,9 @@ def store(builder: Any, vector: Vector, table: Any, first: int) -> None:
 
 
 def _lane(builder: Any, table: Any, index: Vector, k: int) -> Any:
-    """Return where lane k's element of a table lies."""
+    """Return where lane k's element of a table lies; no index is negative."""
     place = builder.extract_element(index.value, ir.Constant(INT, k))
-    return builder.gep(table, [builder.sext(place, LONG)])
+    return builder.gep(table, [builder.zext(place, LONG)])
 
 
 def gather(builder: Any, table: Any, index: Vector) -> Vector:
@@ -182,11 +182,27 @@ def gather_four(builder: Any, table: Any, index: Vector) -> list[Vector]:
 
 def fetch_ahead(builder: Any, table: Any, index: Vector) -> None:
     """Ask for the table's elements at each lane's index, to be near when they are read: no read waits for them."""
+    for k in range(LANES):
+        _fetch(builder, _lane(builder, table, index, k))
+
+
+def _fetch(builder: Any, at: Any) -> None:
     byte = ir.IntType(8).as_pointer()
     function = _intrinsic(builder, "llvm.prefetch.p0", ir.VoidType(), [byte, INT, INT, INT])
-    for k in range(LANES):
-        at = builder.bitcast(_lane(builder, table, index, k), byte)
-        builder.call(function, [at, ir.Constant(INT, 0), ir.Constant(INT, 3), ir.Constant(INT, 1)])
+    hints = [ir.Constant(INT, hint) for hint in (0, 3, 1)]
+    builder.call(function, [builder.bitcast(at, byte), *hints])
+
+
+@intrinsic
+def fetch(typing: Any, table: Any, index: Any) -> Any:
+    """Ask for a table's element at a flat index, to be near when it is read."""
+
+    def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        _fetch(builder, builder.gep(data, [arguments[1]]))
+        return context.get_dummy_value()
+
+    return types.void(table, types.int64), emit
 
 
 @intrinsic

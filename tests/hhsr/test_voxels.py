@@ -38,8 +38,11 @@ class Grid:
         self.octets = self.blob.view(np.uint8)[int(self.record[grid_at.BYTES]) :]
         self.tables = self.blob[int(self.ints[at.MAP_START]) :].view(np.float32)
 
-    def surfels(self) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-        """Return (centre of the voxel, plane, details) of every surfel of a leaf, those beside a cut too."""
+    def surfels(self) -> list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]:
+        """Return (centre of the voxel, plane, details, part) of every surfel of a leaf, those beside a cut too.
+
+        part: (n, c), n·p ≤ c of the voxel's part that counts, in the tree's frame; 0 where it is all.
+        """
         found = []
         for brick in np.argwhere(self.slots >= 0):
             slot = int(self.slots[tuple(brick)])
@@ -49,10 +52,13 @@ class Grid:
                 number = int(self.words[int(self.record[grid_at.BASES]) + slot]) + int(byte)
                 centre = self.low + self.side * (4 * brick + [place >> 4, (place >> 2) & 3, place & 3] + 0.5)
                 _, details = self.parts(number)
-                sides = [number]
-                if details[SURFEL_OWNER] < 0:
-                    sides = [int(details[EXTRA]), int(details[EXTRA]) + 1]
-                found.extend((centre, *self.parts(side)) for side in sides)
+                if details[SURFEL_OWNER] >= 0:
+                    found.append((centre, *self.parts(number), np.zeros(4)))
+                    continue
+                node = int(self.ints[at.NODE_FLOATS]) + at.NODE_FLOAT_SIZE * (-1 - int(details[SURFEL_OWNER]))
+                cut = self.blob[node : node + 4]
+                found.append((centre, *self.parts(int(details[EXTRA])), cut))
+                found.append((centre, *self.parts(int(details[EXTRA]) + 1), -cut))
         return found
 
     def parts(self, number: int) -> tuple[FloatArray, FloatArray]:
@@ -72,9 +78,9 @@ def test_a_plane_holds_all_over_its_voxel(depth: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     surfels = grid.surfels()
     assert len(surfels) > 1000
-    bent = 0
+    bent = sides = 0
     for k in rng.choice(len(surfels), 400, replace=False):
-        centre, plane, details = surfels[k]
+        centre, plane, details, part = surfels[k]
         leaf = grid.leaf(int(details[SURFEL_OWNER]))
         u = rng.uniform(-0.5, 0.5, (12, 3))
         u[:8] = 0.5 * (np.array(np.unravel_index(np.arange(8), (2, 2, 2))).T * 2 - 1)  # the corners too
@@ -82,8 +88,10 @@ def test_a_plane_holds_all_over_its_voxel(depth: int, seed: int) -> None:
             p = into_leaf(grid.blob, grid.ints, leaf, *(centre + grid.side * v))
             true = excess(grid.blob, grid.ints, leaf, *p)
             model = float(plane[:3].astype(float) @ v + plane[OFFSET])
-            if not plane[:3].any():  # a side of a cut, proven whole
-                assert (true > 0) == (model > 0)
+            if not plane[:3].any():  # a side of a cut, proven whole: the part of the voxel on that side
+                if part[:3] @ (centre + grid.side * v) <= part[3]:
+                    assert (true > 0) == (model > 0)
+                    sides += 1
                 continue
             thick = float(details[THICK])
             assert abs(true - thick * model) <= thick
@@ -101,6 +109,7 @@ def test_a_plane_holds_all_over_its_voxel(depth: int, seed: int) -> None:
                 slopes.append(excess_along(grid.blob, grid.ints, leaf, *p, *d)[1])
             assert abs(slopes[0] - thick * float(plane[:3].astype(float) @ way)) <= details[TURN]
             assert abs(slopes[1] - slopes[0]) <= details[BEND] * 1e-2 + 1e-9
+    assert sides > 0 or depth == 0
     assert bent > 0 or depth == 0  # a single leaf may have exponents, which bound no bend
 
 

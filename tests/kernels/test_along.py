@@ -1,0 +1,79 @@
+"""The scale field along a line, of one direction and of eight side by side: the same bits, the formula's numbers."""
+
+from __future__ import annotations
+
+import ctypes
+
+import llvmlite.binding as llvm
+import numpy as np
+import pytest
+from llvmlite import ir
+
+from hhsr.kernels.along import ALONG_ROWS, CHANGE, FIELD, TANGENT, UNIT, emit_field, emit_fields
+from hhsr.kernels.sphere_rbf import scale_on_sphere
+from hhsr.kernels.vectors import LANES
+
+Calls = tuple[object, object, object]
+
+
+@pytest.fixture(scope="module")
+def calls() -> Calls:
+    """What is emitted for one direction, and for LANES, as functions of addresses, compiled; and what keeps them."""
+    double, long = ir.DoubleType(), ir.IntType(64)
+    module = ir.Module()
+    table = double.as_pointer()
+    one = ir.Function(module, ir.FunctionType(ir.VoidType(), [table, table, long]), "one")
+    builder = ir.IRBuilder(one.append_basic_block())
+    way = [builder.load(builder.gep(one.args[0], [ir.Constant(long, k)])) for k in range(6)]
+    sums = emit_field(builder, one.args[1], ir.Constant(long, 0), one.args[2], way[:3], way[3:])
+    for k, total in enumerate(sums):
+        builder.store(total, builder.gep(one.args[0], [ir.Constant(long, 6 + k)]))
+    builder.ret_void()
+    many = ir.Function(module, ir.FunctionType(ir.VoidType(), [table, table, long, long]), "many")
+    builder = ir.IRBuilder(many.append_basic_block())
+    emit_fields(builder, many.args[0], many.args[1], ir.Constant(long, 0), *many.args[2:])
+    builder.ret_void()
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    machine = llvm.Target.from_default_triple().create_target_machine()
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(str(module)), machine)
+    engine.finalize_object()
+    pointer, integer = ctypes.c_void_p, ctypes.c_int64
+    of_one = ctypes.CFUNCTYPE(None, pointer, pointer, integer)(engine.get_function_address("one"))
+    of_many = ctypes.CFUNCTYPE(None, pointer, pointer, integer, integer)(engine.get_function_address("many"))
+    return of_one, of_many, engine
+
+
+def directions(rng: np.random.Generator) -> np.ndarray:
+    """Return rows (ALONG_ROWS, LANES) of unit directions and tangents, the sums not yet known."""
+    rows = np.full((ALONG_ROWS, LANES), np.nan)
+    unit = rng.normal(size=(3, LANES))
+    unit /= np.sqrt((unit**2).sum(axis=0))
+    way = rng.normal(size=(3, LANES))
+    rows[UNIT : UNIT + 3], rows[TANGENT : TANGENT + 3] = unit, way - (way * unit).sum(axis=0) * unit
+    return rows
+
+
+@pytest.mark.parametrize("real", [0, 1, 8, 21, 40])
+def test_eight_directions_have_the_sums_of_each_and_of_the_formula(calls: Calls, real: int) -> None:
+    of_one, of_many, _ = calls
+    rng = np.random.default_rng(real)
+    count = -(-real // LANES) * LANES  # filled up by rows of zeros
+    block = np.zeros((5, count))
+    centres = rng.normal(size=(3, real))
+    block[:3, :real] = centres / np.sqrt((centres**2).sum(axis=0))
+    block[3, :real], block[4, :real] = rng.uniform(0.4, 3.0, real), rng.normal(size=real)
+    rows = directions(rng)
+    of_many(rows.ctypes.data, block.ctypes.data, count, real)  # type: ignore[operator]
+    for lane in range(LANES):
+        own = np.ascontiguousarray(rows[:, lane])
+        own[FIELD:] = np.nan
+        of_one(own.ctypes.data, block.ctypes.data, count)  # type: ignore[operator]
+        assert np.array_equal(own[[FIELD, CHANGE]], rows[[FIELD, CHANGE], lane])
+        unit, way = rows[UNIT : UNIT + 3, lane], rows[TANGENT : TANGENT + 3, lane]
+        formula = [
+            scale_on_sphere(*(unit + step * way), block[:3].T.copy(), block[3], block[4]) for step in (0.0, 1e-6, -1e-6)
+        ]
+        size = np.abs(block[4]).sum()
+        assert rows[FIELD, lane] == pytest.approx(formula[0], abs=1e-13 * (1 + size))
+        assert rows[CHANGE, lane] == pytest.approx((formula[1] - formula[2]) / 2e-6, abs=1e-5 * (1 + size))
