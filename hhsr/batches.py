@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from hhsr.kernels.curve_order import order_along_curve
 from hhsr.model import FloatArray
 
-PARTS_PER_THREAD = 4
+SHARE = 0.5  # of what is left, for each thread, is a part
+LEAST = 8  # as many of the last parts make the smallest batch that is parted
 FEW = 2_000
 _POOLS: dict[int, ThreadPoolExecutor] = {}
 _OPENING = Lock()
@@ -41,6 +42,15 @@ def _pool(threads: int) -> ThreadPoolExecutor:
         return _POOLS[threads]
 
 
+def _edges(count: int, threads: int, least: int) -> list[int]:
+    """Return where parts begin and end: ever smaller ones, so that no thread waits long for another's last part."""
+    edges = [0]
+    while edges[-1] < count:
+        rest = count - edges[-1]
+        edges.append(edges[-1] + min(max(int(SHARE * rest / threads), least), rest))
+    return edges
+
+
 def in_parts(count: int, smallest: int, work: Callable[[int, int], Any]) -> list[Any]:
     """Return [work(start, stop), …] over 0 … count in order; on several threads from 2·`smallest` rows on.
 
@@ -49,10 +59,9 @@ def in_parts(count: int, smallest: int, work: Callable[[int, int], Any]) -> list
     threads = min(numba.get_num_threads(), os.cpu_count() or 1, count // max(smallest, 1))
     if threads <= 1 or getattr(_THREAD, "busy", False):  # a part's own parts: a thread that waits for them helps none
         return [work(0, count)]
-    parts = PARTS_PER_THREAD * threads
-    edges = [count * k // parts for k in range(parts + 1)]
-    results: list[Any] = [None] * parts
-    waiting = deque(range(parts))
+    edges = _edges(count, threads, max(smallest // LEAST, 1))
+    results: list[Any] = [None] * (len(edges) - 1)
+    waiting = deque(range(len(results)))
 
     def share() -> None:
         while waiting:

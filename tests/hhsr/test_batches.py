@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import multiprocessing
 import sys
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numba
 import pytest
 
-from hhsr.batches import PARTS_PER_THREAD, in_parts
+from hhsr.batches import LEAST, in_parts
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +35,10 @@ def test_parts_come_in_order_and_hold_every_row_once() -> None:
     for count in (0, 1, 19, 20, 1003):
         assert all_rows(count) == rows(0, count)
     if numba.get_num_threads() > 1:
-        assert len(in_parts(1003, 10, rows)) == 2 * PARTS_PER_THREAD
+        sizes = [len(part) for part in in_parts(1003, 80, rows)]
+        assert sizes[0] > 1003 // 5
+        assert sizes == sorted(sizes, reverse=True)
+        assert min(sizes[:-1]) == 80 // LEAST
     assert in_parts(19, 10, rows) == [rows(0, 19)]
 
 
@@ -52,6 +57,18 @@ def test_an_error_in_a_part_reaches_the_caller_and_the_next_batch_is_answered() 
         with pytest.raises(ValueError, match="rows"):
             in_parts(1000, 10, fail)
     assert all_rows(1000) == rows(0, 1000)
+
+
+def test_the_caller_works_too() -> None:
+    threads: set[int] = set()
+    in_parts(1000, 10, lambda start, stop: threads.add(threading.get_ident()))
+    assert threading.get_ident() in threads
+
+
+def test_batches_of_several_callers_end() -> None:
+    with ThreadPoolExecutor(3) as callers:
+        found = list(callers.map(all_rows, [1000] * 12))
+    assert found == [rows(0, 1000)] * 12
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forking is what Linux does")
