@@ -49,7 +49,7 @@ from hhsr.kernels.voxels import BASES, BRICK_PLANES, BRICKS, BYTES, DETAILS, PLA
 from hhsr.kernels.walk import SPARE, cross_voxel, go_on
 
 WAITING = 3  # so many lanes are without a stride when the others wait for them
-TOGETHER = 8_192  # segments whose runs are settled together
+TOGETHER = 16_384  # segments whose runs are settled together
 ROW, LIVE = 0, 1
 ALL_LANES = 2**LANES - 1
 # Of a blob: strides count its bytes in 32 bits; interpreted there are none.
