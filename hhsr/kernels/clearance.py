@@ -33,7 +33,7 @@ def _offer_known(search, x, y, z):
 
 
 @unmanaged
-def _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, below, search, local):
+def _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, below, search):
     """Offer two surface points, and go on from them, down and along seams, until one is nearer than `below`."""
     _offer_known(search, ax, ay, az)
     _offer_known(search, bx, by, bz)
@@ -42,7 +42,7 @@ def _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, below, search, local):
         if way < 2:
             descend_from(blob, ints, tab, x, y, z, search)
         else:
-            slide_from(blob, ints, tab, x, y, z, search, local)
+            slide_from(blob, ints, x, y, z, search)
         if search[BEST] < below:
             return
 
@@ -149,7 +149,7 @@ def deepest(
             seed_point(blob, ints, tab, search)
         known = search[BEST] < value - near
         if not known and slow < PATIENCE:
-            _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, value - near, search, local)
+            _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, value - near, search)
             known = search[BEST] < value - near
             slow = slow + 1 if value - search[BEST] < LITTLE * (value - sure) else np.int64(0)
         if not known:

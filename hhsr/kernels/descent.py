@@ -21,6 +21,7 @@ from hhsr.kernels.layout import (
 )
 from hhsr.kernels.maps import jet_near, outside_region, plane_of
 from hhsr.kernels.patch import BEST, FOOT, SPOT, START, TOLERANCE, distance_to, offer, set_spot
+from hhsr.kernels.seam import slide
 from hhsr.kernels.tree import into_leaf, owner_of, turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
 
@@ -38,7 +39,7 @@ def descend(blob, ints, tab, owner, face, a, b, search):
     may be: `onto_surface` makes it exact.
     """
     last = np.inf
-    rough = ROUGH
+    rough, left = ROUGH, np.int64(-1)
     for _ in range(STEPS):
         o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
         leaf = ints[o + OWNER_RECORD]
@@ -124,7 +125,13 @@ def descend(blob, ints, tab, owner, face, a, b, search):
             ox, oy, oz = ox + blob[frame], oy + blob[frame + 1], oz + blob[frame + 2]
             new = owner_of(blob, ints, 0, ox, oy, oz)
             if new != owner:
-                owner = new
+                if new == left:
+                    # To and fro: each leaf's foot lies beyond the cut. The nearest point is one of the seam.
+                    cut = _worst_plane(blob, planes, count, x, y, z)
+                    face, a, b, _ = face_of(x, y, z)
+                    slide(blob, ints, owner, cut, face, a, b, search)
+                    return False
+                left, owner = owner, new
                 leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * owner + OWNER_RECORD]
                 x, y, z = into_leaf(blob, ints, leaf, ox, oy, oz)
                 face, a, b, _ = face_of(x, y, z)
@@ -132,6 +139,17 @@ def descend(blob, ints, tab, owner, face, a, b, search):
         elif max(abs(a), abs(b)) > 1.0:
             face, a, b, _ = face_of(x, y, z)
     return False
+
+
+@unmanaged
+def _worst_plane(blob, planes, count, x, y, z):
+    """Return the float slot of the plane of a region that a point is farthest beyond."""
+    worst, at = -np.inf, planes
+    for k in range(planes, planes + 4 * count, 4):
+        excess = blob[k] * x + blob[k + 1] * y + blob[k + 2] * z - blob[k + 3]
+        if excess > worst:
+            worst, at = excess, k
+    return at
 
 
 @unmanaged
