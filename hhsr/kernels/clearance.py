@@ -41,12 +41,13 @@ def _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, below, search):
     """Offer two surface points, and go on from them, down and along seams, until one is nearer than `below`."""
     _offer_known(search, ax, ay, az)
     _offer_known(search, bx, by, bz)
-    for way in range(4):
-        x, y, z = (ax, ay, az) if way % 2 == 0 else (bx, by, bz)
-        if way < 2:
-            descend_from(blob, ints, tab, x, y, z, search)
-        else:
-            slide_from(blob, ints, x, y, z, search)
+    for way in range(2):
+        x, y, z = (ax, ay, az) if way == 0 else (bx, by, bz)
+        # A way down from a seam comes back to it, if the seam is a valley.
+        slide_from(blob, ints, x, y, z, search)
+        if search[BEST] < below:
+            return
+        descend_from(blob, ints, tab, x, y, z, search)
         if search[BEST] < below:
             return
 
