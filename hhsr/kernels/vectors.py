@@ -10,7 +10,7 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic
+from numba.extending import intrinsic, overload
 
 LANES = 8
 DOUBLE, FLOAT, LONG, INT = ir.DoubleType(), ir.FloatType(), ir.IntType(64), ir.IntType(32)
@@ -168,12 +168,35 @@ def gather_four(builder: Any, table: Any, index: Vector) -> list[Vector]:
 
 def fetch_ahead(builder: Any, table: Any, index: Vector) -> None:
     """Ask for the table's elements at each lane's index, to be near when they are read: no read waits for them."""
+    for k in range(LANES):
+        _fetch(builder, _lane(builder, table, index, k))
+
+
+def _fetch(builder: Any, place: Any) -> None:
     name, byte = "llvm.prefetch.p0", ir.IntType(8).as_pointer()
     kind = ir.FunctionType(ir.VoidType(), [byte, INT, INT, INT])
     function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
-    for k in range(LANES):
-        at = builder.bitcast(_lane(builder, table, index, k), byte)
-        builder.call(function, [at, ir.Constant(INT, 0), ir.Constant(INT, 3), ir.Constant(INT, 1)])
+    at = builder.bitcast(place, byte)
+    builder.call(function, [at, ir.Constant(INT, 0), ir.Constant(INT, 3), ir.Constant(INT, 1)])
+
+
+def ask_ahead(table: Any, index: Any) -> None:
+    """Ask for an element of an array, to be near when it is read: nothing waits for it. Without JIT: do nothing."""
+
+
+@intrinsic
+def _ask_ahead(typing: Any, table: Any, index: Any) -> Any:
+    def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        _fetch(builder, builder.gep(array.data, [arguments[1]]))
+        return context.get_dummy_value()
+
+    return types.void(table, types.int64), emit
+
+
+@overload(ask_ahead, inline="always")
+def _compiled_ask_ahead(table, index):  # type: ignore[no-untyped-def]
+    return lambda table, index: _ask_ahead(table, index)
 
 
 @intrinsic
