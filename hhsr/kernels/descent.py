@@ -28,7 +28,8 @@ from hhsr.kernels.unmanaged import unmanaged
 STEPS = 10
 ROUGH = 4  # of them by the table, at most
 LEFT = 0.02  # tolerances: a point that the next step would bring no nearer is a foot
-SLACK = 0.1  # tolerances: a foot by the table is one where it is proven to lie this near to the surface
+SLACK = 0.1  # tolerances: a foot by the table is one where it is proven to lie this near to the surface; where it lies
+# nearer than the tolerance, the surface point on its ray is
 
 
 @unmanaged
@@ -75,18 +76,20 @@ def descend(blob, ints, tab, owner, face, a, b, search):
             if rough >= 0:
                 # Along the ray the surface is no farther off than this; W is hundreds of times its error.
                 slack = 1.01 * error * m * math.sqrt(x * x + y * y + z * z)
-                if (
-                    slack < SLACK * search[TOLERANCE]
-                    and error < 1e-3 * w
-                    and not outside_region(blob, planes, count, x, y, z, -slack)
-                ):
-                    if distance + slack < search[BEST]:
-                        ox, oy, oz = turn_out_of_leaf(blob, frame, x, y, z)
-                        offer(
-                            search, distance + slack, 0.0, ox + blob[frame], oy + blob[frame + 1], oz + blob[frame + 2]
-                        )
-                        set_spot(search, owner, face, a, b)
-                    return True
+                if slack < search[TOLERANCE] and error < 1e-3 * w:
+                    sx, sy, sz = x, y, z
+                    if slack > SLACK * search[TOLERANCE]:
+                        exact, slack = inverse_radius(blob, ints, leaf, face, a, b), 0.0
+                        sx, sy, sz = x * w / exact, y * w / exact, z * w / exact
+                        distance = math.sqrt((px - sx) ** 2 + (py - sy) ** 2 + (pz - sz) ** 2)
+                    if not outside_region(blob, planes, count, sx, sy, sz, -slack):
+                        if distance + slack < search[BEST]:
+                            sx, sy, sz = turn_out_of_leaf(blob, frame, sx, sy, sz)
+                            sx, sy, sz = sx + blob[frame], sy + blob[frame + 1], sz + blob[frame + 2]
+                            offer(search, distance + slack, 0.0, sx, sy, sz)
+                            if slack > 0.0:
+                                set_spot(search, owner, face, a, b)
+                        return True
                 rough = 0
         # Newton: with B the second derivatives of m·W in space, (1 + h B) δ = what of q − x lies in the tangent plane,
         # for δ in it. In the chart δ = x_a δa + x_b δb, and x_i·B x_j = m W_ij.
