@@ -11,6 +11,7 @@ from hhsr.kernels.discs import BLOCK, DISC_SIZE, LOOSE, WIDE, bound_to_point, bo
 from hhsr.kernels.facets import facet_cell, facet_slot
 from hhsr.kernels.flat_cell import refine_cell
 from hhsr.kernels.layout import (
+    CELL_SIZE,
     ERROR,
     FACET_CODES,
     FACET_COUNT,
@@ -163,8 +164,10 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
                 if level == 0:
                     code = ints[codes + WIDE * i + c]
                     keys[LATE + waiting], nodes[LATE + waiting] = low, code
-                    # A facet's cell lies in no near cache: it comes while other discs are bounded.
-                    ask_ahead(tab, facet_slot(ints, code))
+                    # A facet's cell lies in no near cache, often in two lines: they come while other discs are bounded.
+                    slot = facet_slot(ints, code)
+                    ask_ahead(tab, slot)
+                    ask_ahead(tab, slot + CELL_SIZE - 1)
                     waiting += 1
                     continue
                 # Inserted so that the nearest is next.
