@@ -16,12 +16,16 @@ from hhsr.kernels.layout import integers, tables
 from hhsr.kernels.nearest import seed_point
 from hhsr.kernels.patch import BEST, BEST_T, FAR, FOOT, TOLERANCE, distance_to, offer
 from hhsr.kernels.seam import slide_from
+from hhsr.kernels.spans import close_spans, put_span, summit_of, tell_spans
 from hhsr.kernels.tree import into_tree, out_of_tree
 from hhsr.kernels.unmanaged import managed, unmanaged
 
 ROUGHLY = 6.0  # tolerances: as nearly as a foot is sought that is to lower a bound of the depth
 PATIENCE = 2  # ways on, one after another, that lower a bound of the depth by little
 LITTLE = 0.3  # of what is open
+FIRST_SUMMIT = 9  # parts: then it is asked where it is likely deepest, and at each twice as many
+ROOM = 0.65  # tolerances: as nearly as the distance is asked there; what is left, and the slack, go to a moved segment
+SLACK = 0.1  # tolerances: as much as the walk of a moved segment may err
 SPANS = 256  # parts of one segment's stretch inside
 
 
@@ -33,78 +37,59 @@ def _offer_known(search, x, y, z):
 
 
 @unmanaged
-def _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, below, search, local):
+def _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, below, search):
     """Offer two surface points, and go on from them, down and along seams, until one is nearer than `below`."""
     _offer_known(search, ax, ay, az)
     _offer_known(search, bx, by, bz)
-    for way in range(4):
-        x, y, z = (ax, ay, az) if way % 2 == 0 else (bx, by, bz)
-        if way < 2:
-            descend_from(blob, ints, tab, x, y, z, search)
-        else:
-            slide_from(blob, ints, tab, x, y, z, search, local)
+    for way in range(2):
+        x, y, z = (ax, ay, az) if way == 0 else (bx, by, bz)
+        # A way down from a seam comes back to it, if the seam is a valley.
+        slide_from(blob, ints, x, y, z, search)
+        if search[BEST] < below:
+            return
+        descend_from(blob, ints, tab, x, y, z, search)
         if search[BEST] < below:
             return
 
 
 @unmanaged
-def _highest(px, py, pz, dx, dy, dz, t0, t1, ax, ay, az, bx, by, bz):
-    """Return the greatest min(|p(t) − a|, |p(t) − b|)² on [t0, t1], and its t: an upper bound of the distance²."""
-    dd = dx * dx + dy * dy + dz * dz
-    c0 = (px - ax) ** 2 + (py - ay) ** 2 + (pz - az) ** 2
-    c1 = 2.0 * (dx * (px - ax) + dy * (py - ay) + dz * (pz - az))
-    e0 = (px - bx) ** 2 + (py - by) ** 2 + (pz - bz) ** 2
-    e1 = 2.0 * (dx * (px - bx) + dy * (py - by) + dz * (pz - bz))
-    best, where = -1.0, t0
-    for k in range(3):
-        if k == 0:
-            t = t0
-        elif k == 1:
-            t = t1
-        else:
-            if c1 == e1:
-                continue
-            t = (e0 - c0) / (c1 - e1)
-            if not t0 < t < t1:
-                continue
-        value = min(c0 + t * (c1 + t * dd), e0 + t * (e1 + t * dd))
-        if value > best:
-            best, where = value, t
-    return best, where
+def lift(
+    blob, ints, tab, spans, used, px, py, pz, dx, dy, dz, t, x, y, z, high, slack, ts, work, slots, pending
+):  # fmt: skip
+    """Take out of the spans what is no deeper than `high`, as far as one moved segment shows; return how many are left.
 
-
-@unmanaged
-def _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, b, bx, by, bz):
-    """Write a span: its ends' t and surface points, the highest bound between them, and its t."""
-    spans[s, 0], spans[s, 1], spans[s, 2], spans[s, 3] = a, ax, ay, az
-    spans[s, 4], spans[s, 5], spans[s, 6], spans[s, 7] = b, bx, by, bz
-    value2, spans[s, 9] = _highest(px, py, pz, dx, dy, dz, a, b, ax, ay, az, bx, by, bz)
-    spans[s, 8] = math.sqrt(value2)
-
-
-@unmanaged
-def _tell_spans(spans, used, px, py, pz, dx, dy, dz, x, y, z):
-    """Let a surface point stand for the ends of all spans that it is nearer to than their own."""
+    The segment is moved the way from p(t) to a surface point, by `high` less the slack: where it then is outside, the
+    surface is no farther than it was moved. Slack: as much as the walk may err.
+    """
+    vx, vy, vz = x - (px + t * dx), y - (py + t * dy), z - (pz + t * dz)
+    length = math.sqrt(vx * vx + vy * vy + vz * vz)
+    low, top = np.inf, -np.inf
     for s in range(used):
-        nearer = False
-        for o in range(0, 8, 4):
-            t = spans[s, o]
-            qx, qy, qz = px + t * dx, py + t * dy, pz + t * dz
-            own2 = (spans[s, o + 1] - qx) ** 2 + (spans[s, o + 2] - qy) ** 2 + (spans[s, o + 3] - qz) ** 2
-            if (x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2 < own2:
-                spans[s, o + 1], spans[s, o + 2], spans[s, o + 3] = x, y, z
-                nearer = True
-        if nearer:
-            _put_span(
-                spans, s, px, py, pz, dx, dy, dz, spans[s, 0], spans[s, 1], spans[s, 2], spans[s, 3], spans[s, 4],
-                spans[s, 5], spans[s, 6], spans[s, 7],
-            )  # fmt: skip
+        if spans[s, 8] > high:
+            low, top = min(low, spans[s, 0]), max(top, spans[s, 4])
+    if not (low < top and length > slack and high > slack):
+        return used
+    share = (high - slack) / length
+    vx, vy, vz = px + share * vx, py + share * vy, pz + share * vz
+    inside, count = follow_segment(
+        blob, ints, tab, np.int64(0), vx + low * dx, vy + low * dy, vz + low * dz, vx + top * dx, vy + top * dy,
+        vz + top * dz, 0.5 * slack, 0.5 * slack, np.bool_(False), ts, work, slots, pending,
+    )  # fmt: skip
+    if count > ts.shape[0]:
+        return used
+    begin = low
+    for k in range(count + 1):
+        end = low + ts[k] * (top - low) if k < count else top
+        if not inside:
+            used = close_spans(spans, used, high, px, py, pz, dx, dy, dz, begin, end)
+        inside, begin = not inside, end
+    return used
 
 
 @unmanaged
 def deepest(
     blob, ints, tab, px, py, pz, dx, dy, dz, t0, t1, on0, on1, tolerance, floor, out,
-    search, local, nodes, keys, corners, spare, rects, spans,
+    search, local, nodes, keys, corners, spare, rects, spans, lifted, work, slots, pending,
 ):  # fmt: skip
     """Return an upper bound of the depth on [t0, t1] where p + t·d is inside, at most `tolerance` above the truth.
 
@@ -129,33 +114,40 @@ def deepest(
             x, y, z = search[FOOT], search[FOOT + 1], search[FOOT + 2]
         o = 4 * k
         spans[0, o], spans[0, o + 1], spans[0, o + 2], spans[0, o + 3] = t, x, y, z
-    _put_span(
+    put_span(
         spans, 0, px, py, pz, dx, dy, dz, t0, spans[0, 1], spans[0, 2], spans[0, 3], t1, spans[0, 5], spans[0, 6],
         spans[0, 7],
     )  # fmt: skip
-    used, slow = 1, np.int64(0)
+    used, slow, value, closed, summit = 1, np.int64(0), 0.0, 0.0, np.int64(FIRST_SUMMIT)
     for turn in range(2 * SPANS):
-        s = 0
-        for k in range(1, used):
-            if spans[k, 8] > spans[s, 8]:
-                s = k
-        value, t = spans[s, 8], spans[s, 9]
+        s, value = 0, 0.0
+        for k in range(used):
+            if spans[k, 8] > value:
+                s, value = k, spans[k, 8]
+        t = spans[s, 9]
         if value <= max(sure + tolerance, floor) or used == spans.shape[0] or turn == 2 * SPANS - 1:
             break
+        climbs = turn == summit
+        if climbs:
+            summit *= 2
+            s, t = summit_of(spans, used, px, py, pz, dx, dy, dz, s, t)
         a, ax, ay, az = spans[s, 0], spans[s, 1], spans[s, 2], spans[s, 3]
         b, bx, by, bz = spans[s, 4], spans[s, 5], spans[s, 6], spans[s, 7]
         set_search(search, px + t * dx, py + t * dy, pz + t * dz, 0.0, 0.0, 0.0, ROUGHLY * tolerance)
         if a < t < b:
             seed_point(blob, ints, tab, search)
-        known = search[BEST] < value - near
-        if not known and slow < PATIENCE:
-            _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, value - near, search, local)
+        known = search[BEST] < value - near and not climbs
+        if climbs:
+            _offer_known(search, ax, ay, az)
+            _offer_known(search, bx, by, bz)
+        elif not known and slow < PATIENCE:
+            _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, value - near, search)
             known = search[BEST] < value - near
             slow = slow + 1 if value - search[BEST] < LITTLE * (value - sure) else np.int64(0)
         if not known:
             # Nothing nearer is known, or little by little: what is the true distance there?
             slow = np.int64(0)
-            room = 0.9 * tolerance - max(value - search[BEST], 0.0)
+            room = ROOM * tolerance if climbs else 0.9 * tolerance - max(value - search[BEST], 0.0)
             search[TOLERANCE] = room
             search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, np.bool_(True))
             if search[BEST] - room > sure:
@@ -165,21 +157,28 @@ def deepest(
         onto_surface(blob, ints, search)
         x, y, z = search[FOOT], search[FOOT + 1], search[FOOT + 2]
         if a < t < b:
-            _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, t, x, y, z)
-            _put_span(spans, used, px, py, pz, dx, dy, dz, t, x, y, z, b, bx, by, bz)
+            put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, t, x, y, z)
+            put_span(spans, used, px, py, pz, dx, dy, dz, t, x, y, z, b, bx, by, bz)
             used += 1
         elif t <= a:
-            _put_span(spans, s, px, py, pz, dx, dy, dz, a, x, y, z, b, bx, by, bz)
+            put_span(spans, s, px, py, pz, dx, dy, dz, a, x, y, z, b, bx, by, bz)
         else:
-            _put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, b, x, y, z)
-        _tell_spans(spans, used, px, py, pz, dx, dy, dz, x, y, z)
-    return max(floor, value)
+            put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, b, x, y, z)
+        tell_spans(spans, used, px, py, pz, dx, dy, dz, x, y, z)
+        if climbs:
+            # `sure` only rises, so that what is closed now is near enough at the end.
+            closed = max(sure + tolerance, floor)
+            used = lift(
+                blob, ints, tab, spans, used, px, py, pz, dx, dy, dz, t, x, y, z, closed, SLACK * tolerance, lifted,
+                work, slots, pending,
+            )  # fmt: skip
+    return max(floor, value, closed)
 
 
 @unmanaged
 def _clearance(
     blob, ints, tab, px, py, pz, ex, ey, ez, tolerance, ts, out, search, local, nodes, keys, corners, spare, rects,
-    spans, work, slots, pending,
+    spans, lifted, work, slots, pending,
 ):  # fmt: skip
     """Return the clearance of a segment of the tree's frame. out: (4,) where along it, and the surface point."""
     dx, dy, dz = ex - px, ey - py, ez - pz
@@ -200,7 +199,7 @@ def _clearance(
             deep = max(
                 deep,
                 deepest(blob, ints, tab, px, py, pz, dx, dy, dz, begin, end, k > 0, k < count, 0.8 * tolerance, deep,
-                        out, search, local, nodes, keys, corners, spare, rects, spans),
+                        out, search, local, nodes, keys, corners, spare, rects, spans, lifted, work, slots, pending),
             )  # fmt: skip
         inside, begin = not inside, end
     return -deep - 0.1 * tolerance
@@ -208,8 +207,8 @@ def _clearance(
 
 @managed
 def _clearance_scratch():
-    """Return (ts, out, spans)."""
-    return np.empty(512), np.empty(4), np.empty((SPANS, 10))
+    """Return (ts, out, spans, lifted)."""
+    return np.empty(512), np.empty(4), np.empty((SPANS, 10)), np.empty(64)
 
 
 @njit(cache=True, error_model="numpy")
@@ -220,12 +219,12 @@ def clearance_one(blob, ax, ay, az, bx, by, bz, tolerance):
     ints, tab = integers(blob), tables(blob)
     search, local, nodes, keys, corners, spare, rects = near_scratch()
     work, slots, pending = scratch()
-    ts, out, spans = _clearance_scratch()
+    ts, out, spans, lifted = _clearance_scratch()
     px, py, pz = into_tree(blob, ints, ax, ay, az)
     ex, ey, ez = into_tree(blob, ints, bx, by, bz)
     return _clearance(
         blob, ints, tab, px, py, pz, ex, ey, ez, tolerance, ts, out, search, local, nodes, keys, corners, spare, rects,
-        spans, work, slots, pending,
+        spans, lifted, work, slots, pending,
     )  # fmt: skip
 
 
@@ -239,7 +238,7 @@ def clearance_many(blob, starts, ends, order, tolerance, value, t, foot):
     ints, tab = integers(blob), tables(blob)
     search, local, nodes, keys, corners, spare, rects = near_scratch()
     work, slots, pending = scratch()
-    ts, out, spans = _clearance_scratch()
+    ts, out, spans, lifted = _clearance_scratch()
     bad = 0
     for row in range(starts.shape[0]):
         i = order[row]
@@ -255,7 +254,7 @@ def clearance_many(blob, starts, ends, order, tolerance, value, t, foot):
         ex, ey, ez = into_tree(blob, ints, ends[row, 0], ends[row, 1], ends[row, 2])
         value[i] = _clearance(
             blob, ints, tab, px, py, pz, ex, ey, ez, tolerance, ts, out, search, local, nodes, keys, corners, spare,
-            rects, spans, work, slots, pending,
+            rects, spans, lifted, work, slots, pending,
         )  # fmt: skip
         t[i] = out[0]
         foot[i, 0], foot[i, 1], foot[i, 2] = out_of_tree(blob, ints, out[1], out[2], out[3])

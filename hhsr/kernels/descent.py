@@ -21,13 +21,15 @@ from hhsr.kernels.layout import (
 )
 from hhsr.kernels.maps import jet_near, outside_region, plane_of
 from hhsr.kernels.patch import BEST, FOOT, SPOT, START, TOLERANCE, distance_to, offer, set_spot
+from hhsr.kernels.seam import slide
 from hhsr.kernels.tree import into_leaf, owner_of, turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
 
 STEPS = 10
 ROUGH = 4  # of them by the table, at most
 LEFT = 0.02  # tolerances: a point that the next step would bring no nearer is a foot
-SLACK = 0.1  # tolerances: a foot by the table is one where it is proven to lie this near to the surface
+SLACK = 0.1  # tolerances: a foot by the table is one where it is proven to lie this near to the surface; where it lies
+# nearer than the tolerance, the surface point on its ray is
 
 
 @unmanaged
@@ -38,7 +40,7 @@ def descend(blob, ints, tab, owner, face, a, b, search):
     may be: `onto_surface` makes it exact.
     """
     last = np.inf
-    rough = ROUGH
+    rough, left = ROUGH, np.int64(-1)
     for _ in range(STEPS):
         o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
         leaf = ints[o + OWNER_RECORD]
@@ -74,18 +76,20 @@ def descend(blob, ints, tab, owner, face, a, b, search):
             if rough >= 0:
                 # Along the ray the surface is no farther off than this; W is hundreds of times its error.
                 slack = 1.01 * error * m * math.sqrt(x * x + y * y + z * z)
-                if (
-                    slack < SLACK * search[TOLERANCE]
-                    and error < 1e-3 * w
-                    and not outside_region(blob, planes, count, x, y, z, -slack)
-                ):
-                    if distance + slack < search[BEST]:
-                        ox, oy, oz = turn_out_of_leaf(blob, frame, x, y, z)
-                        offer(
-                            search, distance + slack, 0.0, ox + blob[frame], oy + blob[frame + 1], oz + blob[frame + 2]
-                        )
-                        set_spot(search, owner, face, a, b)
-                    return True
+                if slack < search[TOLERANCE] and error < 1e-3 * w:
+                    sx, sy, sz = x, y, z
+                    if slack > SLACK * search[TOLERANCE]:
+                        exact, slack = inverse_radius(blob, ints, leaf, face, a, b), 0.0
+                        sx, sy, sz = x * w / exact, y * w / exact, z * w / exact
+                        distance = math.sqrt((px - sx) ** 2 + (py - sy) ** 2 + (pz - sz) ** 2)
+                    if not outside_region(blob, planes, count, sx, sy, sz, -slack):
+                        if distance + slack < search[BEST]:
+                            sx, sy, sz = turn_out_of_leaf(blob, frame, sx, sy, sz)
+                            sx, sy, sz = sx + blob[frame], sy + blob[frame + 1], sz + blob[frame + 2]
+                            offer(search, distance + slack, 0.0, sx, sy, sz)
+                            if slack > 0.0:
+                                set_spot(search, owner, face, a, b)
+                        return True
                 rough = 0
         # Newton: with B the second derivatives of m·W in space, (1 + h B) δ = what of q − x lies in the tangent plane,
         # for δ in it. In the chart δ = x_a δa + x_b δb, and x_i·B x_j = m W_ij.
@@ -124,7 +128,13 @@ def descend(blob, ints, tab, owner, face, a, b, search):
             ox, oy, oz = ox + blob[frame], oy + blob[frame + 1], oz + blob[frame + 2]
             new = owner_of(blob, ints, 0, ox, oy, oz)
             if new != owner:
-                owner = new
+                if new == left:
+                    # To and fro: each leaf's foot lies beyond the cut. The nearest point is one of the seam.
+                    cut = _worst_plane(blob, planes, count, x, y, z)
+                    face, a, b, _ = face_of(x, y, z)
+                    slide(blob, ints, owner, cut, face, a, b, search)
+                    return False
+                left, owner = owner, new
                 leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * owner + OWNER_RECORD]
                 x, y, z = into_leaf(blob, ints, leaf, ox, oy, oz)
                 face, a, b, _ = face_of(x, y, z)
@@ -132,6 +142,17 @@ def descend(blob, ints, tab, owner, face, a, b, search):
         elif max(abs(a), abs(b)) > 1.0:
             face, a, b, _ = face_of(x, y, z)
     return False
+
+
+@unmanaged
+def _worst_plane(blob, planes, count, x, y, z):
+    """Return the float slot of the plane of a region that a point is farthest beyond."""
+    worst, at = -np.inf, planes
+    for k in range(planes, planes + 4 * count, 4):
+        excess = blob[k] * x + blob[k + 1] * y + blob[k + 2] * z - blob[k + 3]
+        if excess > worst:
+            worst, at = excess, k
+    return at
 
 
 @unmanaged

@@ -127,8 +127,10 @@ def _nearest_step(blob, ints, tab, search):
             )  # fmt: skip
         else:
             rx, ry, rz = search[START] - ax, search[START + 1] - ay, search[START + 2] - az
-            t, uu = 0.0, ux * ux + uy * uy + uz * uz
-            s = min(max((rx * ux + ry * uy + rz * uz) / uu, 0.0), 1.0) if uu > 0.0 else 0.0
+            t, uu, ru = 0.0, ux * ux + uy * uy + uz * uz, rx * ux + ry * uy + rz * uz
+            if (rx * rx + ry * ry + rz * rz - search[BEST] * search[BEST]) * uu > ru * ru:
+                continue  # not even its line is nearer
+            s = min(max(ru / uu, 0.0), 1.0) if uu > 0.0 else 0.0
             rx, ry, rz = rx - s * ux, ry - s * uy, rz - s * uz
             d2 = rx * rx + ry * ry + rz * rz
         if d2 < search[BEST] * search[BEST]:

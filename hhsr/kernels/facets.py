@@ -17,6 +17,9 @@ from hhsr.kernels.layout import (
     CELLS,
     ERROR,
     FRAME,
+    OWNER_INT_SIZE,
+    OWNER_INTS,
+    OWNER_RECORD,
     PARTING,
     SLOPE_A,
     SLOPE_B,
@@ -34,7 +37,7 @@ from hhsr.kernels.maps import (
     ray_thickness,
 )
 from hhsr.kernels.polygon import ROOM, clip_polygon
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import inlined, unmanaged
 
 THICK, RADIUS = 6, 7  # of a facet's disc (`hhsr.kernels.discs`)
 
@@ -53,6 +56,14 @@ def facet_cell(ints, leaf, code):
     )
     slot = ints[leaf + CELL_TABLE] + CELL_SIZE * ((word >> 4) + cell)
     return slot, base >> 2 * bits, (2 * i + 1) * half - 1.0, (2 * j + 1) * half - 1.0, half
+
+
+@inlined
+def facet_slot(ints, code):
+    """Return the float32 slot of the cell of a facet's code."""
+    leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * (code >> 24) + OWNER_RECORD]
+    word = ints[ints[leaf + PARTING] + ((code >> 9) & 0x7FFF)]
+    return ints[leaf + CELL_TABLE] + CELL_SIZE * ((word >> 4) + ((code >> 1) & 0xFF))
 
 
 @unmanaged

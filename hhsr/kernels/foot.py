@@ -35,7 +35,7 @@ STEPS = 5
 CLOSE = 1.0  # tolerances: a foot this near to where the next step would go is one
 WIDEST = 6  # base cells a side that a ball may cover
 NEARBY = 0.1  # of the depth below its face: farther from a point a surface's own bends make many feet of one
-FARTHEST = 0.2  # of the depth below its face: no foot is proven that is farther along an axis
+FARTHEST = 0.12  # of the depth below its face: no foot is proven that is farther along an axis
 UNPROVEN, FREE, PROVEN = 0, 1, 2
 
 

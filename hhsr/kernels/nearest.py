@@ -8,9 +8,10 @@ import numpy as np
 
 from hhsr.kernels.descent import descend, onto_surface
 from hhsr.kernels.discs import BLOCK, DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment, lowest_bit
-from hhsr.kernels.facets import facet_cell
+from hhsr.kernels.facets import facet_cell, facet_slot
 from hhsr.kernels.flat_cell import refine_cell
 from hhsr.kernels.layout import (
+    CELL_SIZE,
     ERROR,
     FACET_CODES,
     FACET_COUNT,
@@ -47,6 +48,7 @@ from hhsr.kernels.seeds import seed_at
 from hhsr.kernels.settle import settle_cell
 from hhsr.kernels.tree import turn_out_of_leaf
 from hhsr.kernels.unmanaged import inlined, unmanaged
+from hhsr.kernels.vectors import ask_ahead
 
 VAST = 1e9  # mm
 ROUNDING = 1e-9  # of the coordinates
@@ -160,7 +162,12 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
                     continue
                 low = np.float64(bounds[c])
                 if level == 0:
-                    keys[LATE + waiting], nodes[LATE + waiting] = low, ints[codes + WIDE * i + c]
+                    code = ints[codes + WIDE * i + c]
+                    keys[LATE + waiting], nodes[LATE + waiting] = low, code
+                    # A facet's cell lies in no near cache, often in two lines: they come while other discs are bounded.
+                    slot = facet_slot(ints, code)
+                    ask_ahead(tab, slot)
+                    ask_ahead(tab, slot + CELL_SIZE - 1)
                     waiting += 1
                     continue
                 # Inserted so that the nearest is next.

@@ -26,7 +26,7 @@ from hhsr.kernels.stretch import (
 )
 from hhsr.kernels.tree import into_leaf, turn_into_leaf
 from hhsr.kernels.unmanaged import inlined, unmanaged
-from hhsr.kernels.vectors import LANES, fetch
+from hhsr.kernels.vectors import LANES, ask_ahead
 
 # Kinds of runs: none; F is proven monotone; one leaf's; anybody's; no stretch, but a change at one place.
 NONE, MONOTONE, OWN, CLIPPED, POINT = 0, 1, 2, 3, 4
@@ -227,7 +227,7 @@ def ask_for_cells(blob, ints, tab, runs, run):
         x, y, z = into_leaf(blob, ints, leaf, px + t * dx, py + t * dy, pz + t * dz)
         face, a, b, _ = face_of(x, y, z)
         o, _, _, _ = cell_at(ints, leaf, face, a, b)
-        fetch(tab, o)
+        ask_ahead(tab, o)
 
 
 @unmanaged

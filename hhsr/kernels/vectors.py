@@ -10,7 +10,7 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic
+from numba.extending import intrinsic, overload
 
 LANES = 8
 DOUBLE, FLOAT, LONG, INT = ir.DoubleType(), ir.FloatType(), ir.IntType(64), ir.IntType(32)
@@ -186,23 +186,30 @@ def fetch_ahead(builder: Any, table: Any, index: Vector) -> None:
         _fetch(builder, _lane(builder, table, index, k))
 
 
-def _fetch(builder: Any, at: Any) -> None:
+def _fetch(builder: Any, place: Any) -> None:
     byte = ir.IntType(8).as_pointer()
     function = _intrinsic(builder, "llvm.prefetch.p0", ir.VoidType(), [byte, INT, INT, INT])
     hints = [ir.Constant(INT, hint) for hint in (0, 3, 1)]
-    builder.call(function, [builder.bitcast(at, byte), *hints])
+    builder.call(function, [builder.bitcast(place, byte), *hints])
+
+
+def ask_ahead(table: Any, index: Any) -> None:
+    """Ask for an element of an array, to be near when it is read: nothing waits for it. Without JIT: do nothing."""
 
 
 @intrinsic
-def fetch(typing: Any, table: Any, index: Any) -> Any:
-    """Ask for a table's element at a flat index, to be near when it is read."""
-
+def _ask_ahead(typing: Any, table: Any, index: Any) -> Any:
     def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
-        _fetch(builder, builder.gep(data, [arguments[1]]))
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        _fetch(builder, builder.gep(array.data, [arguments[1]]))
         return context.get_dummy_value()
 
     return types.void(table, types.int64), emit
+
+
+@overload(ask_ahead, inline="always")
+def _compiled_ask_ahead(table, index):  # type: ignore[no-untyped-def]
+    return lambda table, index: _ask_ahead(table, index)
 
 
 @intrinsic

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from hhsr.compiled import compile_tree
+from hhsr.kernels.descent import descend_from
 from hhsr.kernels.layout import integers, tables
-from hhsr.kernels.patch import BEST, FOOT, LENGTH2, SEARCH_SIZE, START, TOLERANCE
+from hhsr.kernels.patch import BEST, FAR, FOOT, LENGTH2, SEARCH_SIZE, START, TOLERANCE
 from hhsr.kernels.seam import slide_from
 from hhsr.kernels.tree import into_tree
 from hhsr.model import Cut, FloatArray, ModelLeaf, ScaleField, Superquadric, Tree, frozen
@@ -25,7 +26,7 @@ def two_balls() -> FloatArray:
 @pytest.mark.parametrize("seed", range(5))
 def test_a_slide_ends_at_the_seams_nearest_point(seed: int) -> None:
     blob, rng = two_balls(), np.random.default_rng(seed)
-    ints, tab = integers(blob), tables(blob)
+    ints = integers(blob)
     ring = np.sqrt(SPHERE**2 - 100.0)
     for _ in range(20):
         angle = rng.uniform(-np.pi, np.pi)
@@ -33,11 +34,11 @@ def test_a_slide_ends_at_the_seams_nearest_point(seed: int) -> None:
         turn = angle + rng.uniform(-0.5, 0.5)
         away = rng.uniform(0.7, 1.4) * ring
         point = np.array([rng.uniform(-5, 5), away * np.cos(turn), away * np.sin(turn)])
-        search, local = np.zeros(SEARCH_SIZE), np.zeros(SEARCH_SIZE)
+        search = np.zeros(SEARCH_SIZE)
         search[START : START + 3] = into_tree(blob, ints, *point)
         search[BEST], search[TOLERANCE], search[LENGTH2] = np.linalg.norm(point - start), 0.01, 0.0
         begin = search[BEST]
-        slide_from(blob, ints, tab, *into_tree(blob, ints, *start), search, local)
+        slide_from(blob, ints, *into_tree(blob, ints, *start), search)
         nearest = np.hypot(point[0], away - ring)
         assert nearest - 1e-3 <= search[BEST] <= begin
         assert search[BEST] <= nearest + 0.01
@@ -50,7 +51,30 @@ def test_a_slide_ends_at_the_seams_nearest_point(seed: int) -> None:
 
 def test_off_a_seam_nothing_slides() -> None:
     blob = two_balls()
-    search, local = np.zeros(SEARCH_SIZE), np.zeros(SEARCH_SIZE)
+    search = np.zeros(SEARCH_SIZE)
     search[START : START + 3], search[BEST], search[TOLERANCE] = [45.0, 3.0, 0.0], 6.0, 0.01
-    slide_from(blob, integers(blob), tables(blob), 40.0, 0.0, 0.0, search, local)
+    slide_from(blob, integers(blob), 40.0, 0.0, 0.0, search)
     assert search[BEST] == 6.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_way_down_to_and_fro_between_two_leaves_ends_on_their_seam(seed: int) -> None:
+    blob, rng = two_balls(), np.random.default_rng(seed)
+    ints, tab = integers(blob), tables(blob)
+    ring = np.sqrt(SPHERE**2 - 100.0)
+    for _ in range(20):
+        # From a point near the axis both balls are nearest beyond the cut; the seam is a valley.
+        turn, height = rng.uniform(-np.pi, np.pi), rng.uniform(5.0, 0.8 * ring)
+        reach = 0.9 * 10.0 * (1.0 - height / ring)
+        point = np.array([rng.uniform(-reach, reach), height * np.cos(turn), height * np.sin(turn)])
+        angle, side = turn + rng.uniform(-0.5, 0.5), rng.choice([-1.0, 1.0])
+        away = rng.uniform(-0.3, 0.0)
+        start = np.array([side * (10.0 + SPHERE * away), 0.0, 0.0])
+        start[1:] = SPHERE * np.sqrt(1.0 - away**2) * np.array([np.cos(angle), np.sin(angle)])
+        search = np.zeros(SEARCH_SIZE)
+        search[START : START + 3] = into_tree(blob, ints, *point)
+        search[BEST], search[TOLERANCE], search[LENGTH2] = FAR, 0.01, 0.0
+        descend_from(blob, ints, tab, *into_tree(blob, ints, *start), search)
+        nearest = np.hypot(point[0], height - ring)
+        assert nearest - 1e-9 <= search[BEST] <= nearest + 0.001
+        assert np.hypot(search[FOOT + 1], search[FOOT + 2]) == pytest.approx(ring, abs=1e-3)
