@@ -208,7 +208,7 @@ def _ask_ahead(typing: Any, table: Any, index: Any) -> Any:
 
 
 @overload(ask_ahead, inline="always")
-def _compiled_ask_ahead(table, index):  # type: ignore[no-untyped-def]
+def _compiled_ask_ahead(table, index):
     return lambda table, index: _ask_ahead(table, index)
 
 
