@@ -120,7 +120,10 @@ def _leaf_of(ints, runs, run):
 
 @unmanaged
 def make_ready(blob, ints, runs, run):
-    """Bring a monotone run into its leaf's frame: GUESS within it, MOST the number of its improvements, its key."""
+    """Bring a monotone run into its leaf's frame, GUESS within it; of a smooth one MOST counts its improvements.
+
+    Only smooth ones, whose bend is known, get the key of a block.
+    """
     leaf = _leaf_of(ints, runs, run)
     px, py, pz = runs[run, RUN_FROM], runs[run, RUN_FROM + 1], runs[run, RUN_FROM + 2]
     dx, dy, dz = runs[run, RUN_TO] - px, runs[run, RUN_TO + 1] - py, runs[run, RUN_TO + 2] - pz
@@ -132,7 +135,7 @@ def make_ready(blob, ints, runs, run):
     runs[run, GUESS] = min(max(runs[run, GUESS], runs[run, RUN_BEGIN]), runs[run, RUN_END])
     if runs[run, RUN_BEND] < math.inf:
         runs[run, MOST] = 0.0
-    _set_key(runs, run)
+        _set_key(runs, run)
 
 
 @inlined

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hhsr.compiled import proofs
 from hhsr.model import Cut, ModelLeaf, Node, ScaleField, Superquadric, Tree, frozen
 from hhsr.segments import _cross_alone
 from hhsr.shape import Shape
+from tests.strategies import random_tree
 
 RADIUS, APART, BALLS = 3.0, 8.0, 64
 
@@ -60,6 +62,23 @@ def test_many_segments_have_more_runs_than_expected(balls: Shape) -> None:
         inside, alone = _cross_alone(balls.compiled.blob, starts[k], ends[k], 0.01, 0.001)
         assert not inside
         assert np.array_equal(alone, one.t)
+
+
+def test_leaves_with_exponents_have_runs_of_unknown_bend(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer voxels than a leaf has blocks of directions: a run's key is its surfels' then."""
+    monkeypatch.setattr(proofs, "VOXELS_TOTAL", 600)
+    shape = Shape(random_tree(0, 0))
+    rng = np.random.default_rng(4)
+    low, high = shape.bounds
+    starts, ends = rng.uniform(low - 5, high + 5, (2, 500, 3))
+    found = shape.crossings(starts, ends)
+    assert len(found.t) > 200
+    for k in range(500):
+        one = shape.crossings(starts[k], ends[k])
+        assert np.array_equal(one.t, found.t[found.offsets[k] : found.offsets[k + 1]])
+    odd = np.diff(found.offsets) % 2 == 1
+    assert np.array_equal(odd, shape.contains(starts) != shape.contains(ends))
+    assert np.abs(shape.field(found.points)).max() < 1e-3
 
 
 def test_a_touch_of_two_runs_is_none() -> None:
