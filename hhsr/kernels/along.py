@@ -119,25 +119,6 @@ def _field_along(typing: Any, blob: Any, first: Any, count: Any, unit: Any, way:
     return signature, emit
 
 
-@intrinsic
-def fields_along(typing: Any, rows: Any, blob: Any, first: Any, count: Any, terms: Any) -> Any:
-    """Fill rows FIELD and CHANGE of points side by side (ALONG_ROWS, LANES), over the centres of one block.
-
-    first: their float slot, count: how many; terms: how many from the first on, for those behind have no weight.
-    """
-    signature = types.void(rows, blob, first, count, terms)
-
-    def emit(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
-        rows, blob = (
-            context.make_array(kind)(context, builder, value).data
-            for kind, value in zip(signature.args[:2], arguments[:2], strict=True)
-        )
-        emit_fields(builder, rows, blob, *arguments[2:])
-        return context.get_dummy_value()
-
-    return signature, emit
-
-
 if config.DISABLE_JIT:  # type: ignore[attr-defined]
 
     def field_along(blob: Any, first: int, count: int, unit: Any, way: Any) -> tuple[float, float]:
@@ -145,6 +126,12 @@ if config.DISABLE_JIT:  # type: ignore[attr-defined]
         columns = blob[first : first + 5 * count].reshape(5, count)
         s, fx, fy, fz = gaussian_jet(*columns, *unit)
         return s, fx * way[0] + fy * way[1] + fz * way[2]
+
+    def fields_along(rows: Any, blob: Any, first: int, count: int, terms: int) -> None:
+        """Fill rows FIELD and CHANGE: as compiled, but for the last bits."""
+        for lane in range(LANES):
+            unit, way = rows[UNIT : UNIT + 3, lane], rows[TANGENT : TANGENT + 3, lane]
+            rows[FIELD, lane], rows[CHANGE, lane] = field_along(blob, first, count, unit, way)
 
 else:
 
@@ -155,3 +142,21 @@ else:
         first: float slot of the block's centres, count: how many, a multiple of LANES.
         """
         return _field_along(blob, np.int64(first), np.int64(count), unit, way)
+
+    @intrinsic
+    def fields_along(typing: Any, rows: Any, blob: Any, first: Any, count: Any, terms: Any) -> Any:
+        """Fill rows FIELD and CHANGE of points side by side (ALONG_ROWS, LANES), over the centres of one block.
+
+        first: their float slot, count: how many; terms: how many from the first on, for those behind have no weight.
+        """
+        signature = types.void(rows, blob, first, count, terms)
+
+        def emit(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+            rows, blob = (
+                context.make_array(kind)(context, builder, value).data
+                for kind, value in zip(signature.args[:2], arguments[:2], strict=True)
+            )
+            emit_fields(builder, rows, blob, *arguments[2:])
+            return context.get_dummy_value()
+
+        return signature, emit

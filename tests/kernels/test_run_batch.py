@@ -1,0 +1,55 @@
+"""The runs of many segments, settled together, step by step without the compiler: what each segment alone has."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numba import config
+
+from hhsr.kernels.along import ALONG_ROWS
+from hhsr.kernels.crossing import scratch
+from hhsr.kernels.lane import BEGIN, FIRST_RUN, ROWS, RUNS_USED, set_out
+from hhsr.kernels.layout import integers, tables
+from hhsr.kernels.run_batch import ROOM, gather_crossings, most_keys, order_runs, settle_others, settle_smooth
+from hhsr.kernels.runs import RUN_SIZE
+from hhsr.kernels.segment import PIECES
+from hhsr.kernels.tree import into_tree
+from hhsr.kernels.vectors import LANES
+from hhsr.kernels.walk import go_on
+from tests.kernels.small_solids import arithmetic_of_c, solid  # noqa: F401
+from tests.kernels.test_solid_kernels import SMOOTH, around
+
+COUNT = 25
+
+
+@pytest.mark.skipif(not config.DISABLE_JIT, reason="compiled, every batch of segments asks it")  # type: ignore[attr-defined]
+@pytest.mark.parametrize("name", SMOOTH)
+def test_many_segments_have_the_crossings_of_each(name: str) -> None:
+    shape = solid(name)
+    blob = shape.compiled.blob
+    ints, tab = integers(blob), tables(blob)
+    work, slots, pending = scratch()
+    lanes, runs = work[PIECES : PIECES + ROWS], np.zeros((60 * COUNT, RUN_SIZE))
+    starts, ends = around(name, 6, COUNT), around(name, 7, COUNT)
+    counts, places = np.zeros(COUNT, dtype=np.int64), np.full(COUNT, -1)
+    inside = np.zeros(COUNT, dtype=bool)
+    for i in range(COUNT):
+        p, q = into_tree(blob, ints, *starts[i]), into_tree(blob, ints, *ends[i])
+        if set_out(blob, ints, lanes, 0, *p, *q, math.dist(p, q)):
+            assert go_on(blob, ints, tab, lanes, 0, False, True, runs)
+            places[i], inside[i] = int(lanes[FIRST_RUN, 0]), lanes[BEGIN, 0] > 0.0
+    used = int(lanes[RUNS_USED, 0])
+    order, bins = np.empty(used, dtype=np.int32), np.empty(most_keys(ints), dtype=np.int32)
+    smooth = int(order_runs(blob, ints, runs, used, bins, order))
+    assert sorted(order.tolist()) == list(range(used))
+    found, ts = np.empty(ROOM * (used + 1)), np.empty(ROOM * (used + 1))
+    settle_smooth(blob, ints, runs, order, smooth, 0.001, found, np.empty((ALONG_ROWS, LANES)))
+    begun = np.array([smooth, smooth])
+    assert settle_others(blob, ints, tab, runs, order, used, begun, 0.01, 0.001, found, work, slots, pending)
+    assert gather_crossings(runs, found, False, 0, COUNT, counts, places, ts, 0) == counts.sum()
+    for i in range(COUNT):
+        alone = shape.crossings(starts[i], ends[i])
+        assert np.allclose(ts[places[i] : places[i] + counts[i]], alone.t, rtol=0, atol=1e-12)
+        assert inside[i] == shape.contains(starts[i])
