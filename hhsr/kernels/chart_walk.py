@@ -48,7 +48,7 @@ def follow_cells(
     # The cell ahead is asked for: on a border the one behind would be left at once, and again and again.
     ahead_a, ahead_b = math.copysign(NUDGE, wa), math.copysign(NUDGE, wb)
     least = NUDGE / max(abs(wa), abs(wb), NUDGE)
-    once_a, once_b = 1.0 / wa, 1.0 / wb
+    once_a, once_b = (1.0 / wa if wa != 0.0 else 0.0), (1.0 / wb if wb != 0.0 else 0.0)
     # What a tolerance is as a share of the stretch: mm for a share are at most these.
     share = tolerance * min(w0, w1) / (length * (end - begin) * max(w0, w1))
     x = 0.0
