@@ -14,7 +14,7 @@ from hhsr.kernels.descent import descend_from, onto_surface
 from hhsr.kernels.distance import near_scratch, search_surface, set_search
 from hhsr.kernels.layout import integers, tables
 from hhsr.kernels.nearest import seed_point
-from hhsr.kernels.patch import BEST, BEST_T, FAR, FOOT, TOLERANCE, distance_to, offer
+from hhsr.kernels.patch import BEST, BEST_T, ENOUGH, FAR, FOOT, TOLERANCE, distance_to, offer
 from hhsr.kernels.seam import slide_from
 from hhsr.kernels.spans import close_spans, put_span, summit_of, tell_spans
 from hhsr.kernels.tree import into_tree, out_of_tree
@@ -137,10 +137,10 @@ def deepest(
         if a < t < b:
             seed_point(blob, ints, tab, search)
         known = search[BEST] < value - near and not climbs
-        if climbs:
+        if climbs or (not known and slow >= PATIENCE):
             _offer_known(search, ax, ay, az)
             _offer_known(search, bx, by, bz)
-        elif not known and slow < PATIENCE:
+        elif not known:
             _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, value - near, search)
             known = search[BEST] < value - near
             slow = slow + 1 if value - search[BEST] < LITTLE * (value - sure) else np.int64(0)
@@ -148,9 +148,10 @@ def deepest(
             # Nothing nearer is known, or little by little: what is the true distance there?
             slow = np.int64(0)
             room = ROOM * tolerance if climbs else 0.9 * tolerance - max(value - search[BEST], 0.0)
-            search[TOLERANCE] = room
-            search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, np.bool_(True))
-            if search[BEST] - room > sure:
+            # A place where it is much less deep than the bound says is not the deepest: what is nearer there will do.
+            search[TOLERANCE], search[ENOUGH] = room, 0.0 if climbs else value - tolerance
+            proven = search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, np.bool_(True))
+            if proven and search[BEST] - room > sure:
                 sure = search[BEST] - room
                 if search[BEST] > floor:
                     out[0], out[1], out[2], out[3] = t, search[FOOT], search[FOOT + 1], search[FOOT + 2]

@@ -51,11 +51,13 @@ def least_over_polygon(c, ca, cb, aa, ab, bb, corners, size):
 
 @unmanaged
 def clipped_is_clear(
-    blob, planes, count, search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third, corners, spare
-):
+    blob, planes, count, search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third, error, corners, spare
+):  # fmt: skip
     """Return (clear, δa, δb) as `square_is_clear` does, of the surface over the square that lies in a region.
 
-    planes, count: of the region, n·p ≤ c from a float slot on, leaf's frame. corners, spare: (ROOM, 3) scratch.
+    planes, count: of the region, n·p ≤ c from a float slot on, leaf's frame. error: how far W may lie from its
+    quadratic but for kink and third; by what that moves the surface the radius is greater.
+    corners, spare: (ROOM, 3) scratch.
     """
     c, ca, cb, aa, ab, bb, slack = bounding_quadratic(
         search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third
@@ -75,7 +77,7 @@ def clipped_is_clear(
         nx, ny, nz, place = blob[o], blob[o + 1], blob[o + 2], blob[o + 3]
         along = nx * x + ny * y + nz * z
         na, nb = minor_parts(face, nx, ny, nz)
-        room = abs(place) * strays + ROUNDING * (abs(along) + abs(place) * w) - (along - place * w)
+        room = abs(place) * (strays + error) + ROUNDING * (abs(along) + abs(place) * w) - (along - place * w)
         size = clip_polygon(corners, size, spare, na - place * wa, nb - place * wb, 0.0, room)
         if size == 0:
             return True, 0.0, 0.0

@@ -36,6 +36,7 @@ from hhsr.kernels.nearest_slab import nearest_on_slab
 from hhsr.kernels.patch import (
     BEST,
     BEST_T,
+    ENOUGH,
     FAR,
     FOOT,
     LATE,
@@ -83,7 +84,7 @@ def set_search(search, px, py, pz, dx, dy, dz, tolerance):
     search[LENGTH2] = dx * dx + dy * dy + dz * dz
     search[BEST], search[BEST_T] = FAR, 0.0
     search[FOOT], search[FOOT + 1], search[FOOT + 2] = np.nan, np.nan, np.nan
-    search[TOLERANCE], search[SPOT], search[SIDE] = tolerance, -1.0, 0.0
+    search[TOLERANCE], search[SPOT], search[SIDE], search[ENOUGH] = tolerance, -1.0, 0.0, 0.0
 
 
 @unmanaged
@@ -141,7 +142,8 @@ def _nearest_step(blob, ints, tab, search):
 def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, seeded):
     """Find the surface point nearest to the search's segment, to its tolerance: truth ∈ [best − tolerance, best].
 
-    seeded: of a point, and what `seed_point` gives is known already.
+    seeded: of a point, and what `seed_point` gives is known already. Returns whether that is proven: not where a point
+    was found that is enough.
     """
     if search[LENGTH2] == 0.0:
         outcome = nearest_by_charts(blob, ints, tab, search, local, nodes, spare)
@@ -149,8 +151,11 @@ def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, 
             _nearest_step(blob, ints, tab, search)
         if outcome != UNPROVEN:
             onto_surface(blob, ints, search)
-            return
+            return True
     nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, seeded)
+    if search[BEST] < search[ENOUGH]:
+        onto_surface(blob, ints, search)
+        return False
     _nearest_step(blob, ints, tab, search)
     for owner in range(ints[OWNER_COUNT]):
         o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
@@ -162,6 +167,7 @@ def search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, 
     onto_surface(blob, ints, search)
     if search[BEST] == FAR:
         search[BEST] = np.inf
+    return True
 
 
 @unmanaged

@@ -30,6 +30,7 @@ from hhsr.kernels.layout import (
 from hhsr.kernels.patch import (
     BEST,
     BEST_T,
+    ENOUGH,
     FAR,
     FOOT,
     LATE,
@@ -114,7 +115,7 @@ def _seed_segment(blob, ints, tab, search, local):
 
 @unmanaged
 def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, seeded):
-    """Improve the search (tree's frame) by the surface of all model leaves, each within its region.
+    """Improve the search (tree's frame) by the surface of all model leaves, each within its region, until it is enough.
 
     seeded: of a point, and what a seed gives is known already. nodes, keys: (LATE + NODE_ROOM + 8,) scratch: pending
     blocks and their bounds, from LATE on the facets yet to be settled; last the bounds of a block.
@@ -124,7 +125,7 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
     levels, codes = ints[FACET_LEVELS], ints[FACET_CODES]
     moving = search[LENGTH2] > 0.0
     local[VECTOR], local[VECTOR + 1], local[VECTOR + 2] = 0.0, 0.0, 0.0
-    local[TOLERANCE] = search[TOLERANCE]
+    local[TOLERANCE], local[ENOUGH] = search[TOLERANCE], search[ENOUGH]
     if moving:
         _seed_segment(blob, ints, tab, search, local)
     elif not seeded:
@@ -182,6 +183,8 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
         while waiting > (PATIENCE if depth > 0 else 0):
             waiting = _settle_nearest(blob, ints, tab, waiting, search, local, nodes, keys, corners, spare, rects)
             limit = search[BEST] - search[TOLERANCE]
+        if search[BEST] < search[ENOUGH]:
+            return
 
 
 @inlined

@@ -25,9 +25,10 @@ from hhsr.kernels.unmanaged import inlined, unmanaged
 
 # Slots of a search: start 3, vector 3, squared length; best distance, t, point 3 (owner's frame); tolerance; and where
 # the best point is the table's, its spot: owner (−1: it is exact), face, a, b; the exact one along that ray is no
-# farther than the best distance. Last, where the start is proven to lie: 1 outside, −1 inside, 0 not known.
-START, VECTOR, LENGTH2, BEST, BEST_T, FOOT, TOLERANCE, SPOT, SIDE = 0, 3, 6, 7, 8, 9, 12, 13, 17
-SEARCH_SIZE = 18
+# farther than the best distance. Where the start is proven to lie: 1 outside, −1 inside, 0 not known. Last, a distance
+# below which any surface point will do: a search that has found one ends, and proves nothing.
+START, VECTOR, LENGTH2, BEST, BEST_T, FOOT, TOLERANCE, SPOT, SIDE, ENOUGH = 0, 3, 6, 7, 8, 9, 12, 13, 17, 18
+SEARCH_SIZE = 19
 LATE = 256  # room for pending nodes
 NODE_ROOM = 256  # room for facets to be settled, and for parts of one
 FAR = 1e150  # mm: no surface point found yet; finite, so that "no surface here" (infinite) is beyond it

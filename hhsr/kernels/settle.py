@@ -12,7 +12,7 @@ from hhsr.kernels.clipped_quadratic import clipped_is_clear
 from hhsr.kernels.jet import inverse_radius_bend
 from hhsr.kernels.layout import KINK, THIRD
 from hhsr.kernels.maps import jet_of, outside_region
-from hhsr.kernels.patch import BEST, FINEST, NODE_ROOM, TOLERANCE, distance_to, offer
+from hhsr.kernels.patch import BEST, ENOUGH, FINEST, NODE_ROOM, TOLERANCE, distance_to, offer
 from hhsr.kernels.quadratic import square_is_clear
 from hhsr.kernels.unmanaged import inlined, unmanaged
 
@@ -52,18 +52,37 @@ def improves(blob, ints, leaf, planes, count, search, face, a, b, wa, wb):
 
 @unmanaged
 def _is_clear(
-    blob, planes, count, search, stray, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third, corners, spare
-):
-    """Return (clear, δa, δb) of the part of a square that lies in the region: `square_is_clear`."""
+    blob, planes, count, search, stray, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third, error, corners, spare
+):  # fmt: skip
+    """Return (clear, δa, δb) of the part of a square that lies in the region: `square_is_clear`.
+
+    stray (mm), error (of W): how far the surface may lie along a ray from that of the quadratic, kink and third.
+    """
     radius = min(search[BEST] - search[TOLERANCE], WIDEST)
     if radius <= 0.0:
         return True, 0.0, 0.0
     if count == 0:
         return square_is_clear(search, radius + stray, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third)
     return clipped_is_clear(
-        blob, planes, count, search, radius + stray, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third, corners,
-        spare,
+        blob, planes, count, search, radius + stray, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third, error,
+        corners, spare,
     )  # fmt: skip
+
+
+@unmanaged
+def _table_stray(a, b, half, w, wa, wb, waa, wab, wbb, kink, third):
+    """Return (how far (mm) the surface of a cell can lie along a ray from the table's quadratic, how far W from it).
+
+    Infinite where it is not known.
+    """
+    r = half * math.sqrt(2.0)
+    bend = 0.5 * abs(waa + wbb) + math.sqrt(0.25 * (waa - wbb) ** 2 + wab * wab)
+    error = (0.5 * kink + third * r / 6.0) * r * r + 1e-6 * w
+    low = w - (math.sqrt(wa * wa + wb * wb) + 0.5 * bend * r) * r - error
+    if not low > 0.5 * w:
+        return math.inf, error
+    far_a, far_b = abs(a) + half, abs(b) + half
+    return math.sqrt(1.0 + far_a * far_a + far_b * far_b) * error / (low * low) * (1.0 + 1e-9), error
 
 
 @inlined
@@ -83,26 +102,41 @@ def settle_cell(blob, ints, tab, leaf, planes, count, search, face, o, a, b, hal
     for turn in range(2):
         clear, da, db = _is_clear(
             blob, planes, count, search, stray, face, a, b, half, w, sa, sb, aa, ab, bb, kink, third,
-            corners, spare,
+            0.0, corners, spare,
         )  # fmt: skip
         if clear:
             return True
         if turn == 1 or not improves(blob, ints, leaf, planes, count, search, face, a + da, b + db, sa, sb):
             break
+    if search[BEST] < search[ENOUGH]:
+        return True  # the search ends here
+    cell_a, cell_b, cell_half, cell_w = a, b, half, w
+    aside, error = _table_stray(a, b, half, w, sa, sb, aa, ab, bb, kink, third)
     # From here on the bounds are asked between any two points of the cell, not from its middle: twice as much.
     kink, third = 2.0 * kink, 2.0 * third
     depth = _part(rects, 0, a, b, half)
     while depth > 0:
         depth -= 1
         a, b, half = rects[depth, 0], rects[depth, 1], rects[depth, 2]
+        if 4.0 * half > cell_half and aside < search[TOLERANCE]:
+            # A quarter, first by the table's quadratic about its own middle: an exact jet costs several times as much.
+            da, db = a - cell_a, b - cell_b
+            ra, rb = aa * da + ab * db, ab * da + bb * db
+            clear, _, _ = _is_clear(
+                blob, planes, count, search, aside, face, a, b, half,
+                cell_w + (sa + 0.5 * ra) * da + (sb + 0.5 * rb) * db, sa + ra, sb + rb, aa, ab, bb, 0.0, 0.0, error,
+                corners, spare,
+            )  # fmt: skip
+            if clear:
+                continue
         w, wa, wb, waa, wab, wbb = inverse_radius_bend(blob, ints, leaf, face, a, b)
         if w == 0.0:
             return False
         clear = False
         for turn in range(2):
             clear, da, db = _is_clear(
-                blob, planes, count, search, 0.0, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third, corners,
-                spare,
+                blob, planes, count, search, 0.0, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third, 0.0,
+                corners, spare,
             )  # fmt: skip
             if (
                 clear
@@ -112,6 +146,8 @@ def settle_cell(blob, ints, tab, leaf, planes, count, search, face, o, a, b, hal
                 break
         if clear:
             continue
+        if search[BEST] < search[ENOUGH]:
+            return True
         if half / w < FINEST:
             x, y, z = direction_of(face, a, b)
             if not outside_region(blob, planes, count, x / w, y / w, z / w, FINEST):

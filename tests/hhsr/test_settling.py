@@ -186,8 +186,8 @@ def test_a_clipped_square_is_called_clear_only_where_it_is(one: ModelLeaf) -> No
             if not np.isfinite(radius):
                 continue
             clear, da, db = clipped_is_clear(
-                np.concatenate(planes), 0, len(planes), search, radius, face, a, b, half, *jet, kink, third, corners,
-                spare,
+                np.concatenate(planes), 0, len(planes), search, radius, face, a, b, half, *jet, kink, third, 0.0,
+                corners, spare,
             )  # fmt: skip
             assert max(abs(da), abs(db)) <= half * (1 + 1e-9)
             assert not (clear and radius > nearest)
