@@ -91,15 +91,13 @@ def neighbours_first(points: FloatArray) -> NDArray[np.int64]:
 
     Of few points they lie too far apart for that: these stay as they are.
     """
-    if len(points) < FEW:
-        return np.arange(len(points))
-    order = np.empty(len(points), dtype=np.int64)
-    order_along_curve(points, np.empty(len(points), dtype=np.int32), order)
-    return order
+    return by_middles(points, points)
 
 
 def by_middles(starts: FloatArray, ends: FloatArray) -> NDArray[np.int64]:
     """Return an order of segments (n, 3) → (n, 3): that of `neighbours_first` of their middles."""
     if len(starts) < FEW:
         return np.arange(len(starts))
-    return neighbours_first(starts + ends)  # twice the middles: the order is the same
+    order = np.empty(len(starts), dtype=np.int64)
+    order_along_curve(starts, ends, np.empty(len(starts), dtype=np.int32), order)
+    return order

@@ -5,6 +5,9 @@ Each returns its answers in the order of the rows, and how many of those are not
 
 from __future__ import annotations
 
+from itertools import count
+from operator import itemgetter
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,7 +16,7 @@ from hhsr.batches import by_middles, in_parts, neighbours_first
 from hhsr.kernels.clearance import clearance_many
 from hhsr.kernels.crossing_places import place_all, place_counts, place_first
 from hhsr.kernels.distance import nearest_many
-from hhsr.model import FloatArray
+from hhsr.model import FloatArray, IntArray
 from hhsr.segments import cross_segments
 
 
@@ -49,51 +52,47 @@ def first_of_rows(
     blob: FloatArray, starts: FloatArray, ends: FloatArray, resolution: float, tolerance: float
 ) -> tuple[FloatArray, int]:
     """Return (n,) t of the first crossing of segments (n, 3): NaN where there is none, −1 where not finite."""
-    order = by_middles(starts, ends)
-    t = np.empty(len(order))
-
-    def part(i: int, j: int) -> int:
-        some = order[i:j]
-        counts, places, begins = np.empty(j - i, np.int64), np.empty(j - i, np.int64), np.empty(j - i, np.bool_)
-        found = cross_segments(
-            blob, _rows(starts, some), _rows(ends, some), True, resolution, tolerance, counts, begins, places
-        )
-        return int(place_first(some, counts, places, found, t))
-
-    return t, sum(in_parts(len(order), 4_000, part))
+    counts, _, places, bases, ts = _followed(blob, starts, ends, True, resolution, tolerance)
+    t = np.empty(len(counts))
+    return t, int(place_first(counts, places, bases, ts, t))
 
 
 def crossings_of_rows(
     blob: FloatArray, starts: FloatArray, ends: FloatArray, resolution: float, tolerance: float
 ) -> Crossings:
     """Return the crossings of segments (n, 3); none, and not valid, where a segment is not finite."""
-    order = by_middles(starts, ends)
-    n = len(order)
-    counts, places, begins = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.bool_)
-    valid, offsets = np.empty(n, np.bool_), np.zeros(n + 1, np.int64)
-
-    def part(i: int, j: int) -> tuple[int, int, FloatArray, FloatArray, FloatArray]:
-        some = slice(i, j)
-        first, last = _rows(starts, order[some]), _rows(ends, order[some])
-        found = cross_segments(
-            blob, first, last, False, resolution, tolerance, counts[some], begins[some], places[some]
-        )
-        place_counts(order[some], counts[some], valid, offsets[1:])
-        return i, j, first, last, found
-
-    parts = in_parts(n, 4_000, part)
-    np.cumsum(offsets, out=offsets)
+    counts, begins, places, bases, ts = _followed(blob, starts, ends, False, resolution, tolerance)
+    n = len(counts)
+    valid, offsets = np.empty(n, np.bool_), np.empty(n + 1, np.int64)
+    place_counts(counts, valid, offsets)
     m = int(offsets[-1])
     t, points, entering = np.empty(m), np.empty((m, 3)), np.empty(m, np.bool_)
-
-    def place(k: int, stop: int) -> None:
-        for i, j, first, last, found in parts[k:stop]:
-            place_all(
-                first, last, order[i:j], counts[i:j], begins[i:j], places[i:j], found, offsets, t, points, entering
-            )
-
-    in_parts(len(parts), 1, place)
+    in_parts(
+        n,
+        20_000,
+        lambda i, j: place_all(starts, ends, i, j, begins, places, bases, ts, offsets, t, points, entering),
+    )
     return Crossings(offsets, t, points, entering, valid)
+
+
+def _followed(
+    blob: FloatArray, starts: FloatArray, ends: FloatArray, first: bool, resolution: float, tolerance: float
+) -> tuple[IntArray, NDArray[np.bool_], IntArray, IntArray, FloatArray]:
+    """Return what `cross_segments` tells of segments (n, 3), in parts: counts, begins, places; bases and t of all."""
+    order = by_middles(starts, ends)
+    n = len(order)
+    counts, begins, places = np.empty(n, np.int64), np.empty(n, np.bool_), np.empty(n, np.int64)
+    numbers = count()
+
+    def part(i: int, j: int) -> tuple[int, FloatArray]:
+        number = next(numbers)
+        return number, cross_segments(
+            blob, starts, ends, order[i:j], first, resolution, tolerance, counts, begins, places, number
+        )
+
+    found = [ts for _, ts in sorted(in_parts(n, 4_000, part), key=itemgetter(0))]
+    bases = np.cumsum([0, *(len(ts) for ts in found)])
+    return counts, begins, places, bases, found[0] if len(found) == 1 else np.concatenate(found)
 
 
 def _rows(points: FloatArray, order: NDArray[np.int64]) -> FloatArray:

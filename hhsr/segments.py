@@ -6,34 +6,41 @@ import numpy as np
 
 from hhsr.kernels.crossing import cross_one
 from hhsr.kernels.crossing_many import cross_many
+from hhsr.kernels.crossing_places import PART_SHIFT
 from hhsr.kernels.run_batch import MANY, ROOM
-from hhsr.model import FloatArray
+from hhsr.model import FloatArray, IntArray
 
 
 def cross_segments(
     blob: FloatArray,
     starts: FloatArray,
     ends: FloatArray,
+    order: IntArray,
     first: bool,
     resolution: float,
     tolerance: float,
-    counts: np.ndarray,
+    counts: IntArray,
     begins: np.ndarray,
-    places: np.ndarray,
+    places: IntArray,
+    part: int = 0,
 ) -> FloatArray:
-    """Return (m,) t of the crossings of LPS segments (n, 3) → (n, 3), each segment's in order, all or the first.
+    """Return (m,) t of the crossings of rows `order` of LPS segments (n, 3) → (n, 3), each one's in order, all or one.
 
-    Fills counts (n,) of each, −1 where it is not finite; begins (n,) whether it starts inside; places (n,) where its
-    crossings begin among all.
+    Fills those rows of counts (n,), −1 where a segment is not finite; of begins (n,), whether it starts inside; of
+    places (n,): where its crossings begin among all of this part, in the form of `hhsr.kernels.crossing_places`.
     """
-    t: FloatArray = cross_many(blob, starts, ends, first, resolution, tolerance, counts, begins, places)
+    base = part << PART_SHIFT
+    t: FloatArray
+    t, alone = cross_many(blob, starts, ends, order, first, resolution, tolerance, counts, begins, places, base)
+    if alone == 0:
+        return t
     found, used = [t], len(t)
-    for i in np.flatnonzero(counts == MANY):
+    for i in order[counts[order] == MANY]:
         begins[i], more = _cross_alone(blob, starts[i], ends[i], resolution, tolerance)
         found.append(more[:1] if first else more)
-        counts[i], places[i] = len(found[-1]), used
+        counts[i], places[i] = len(found[-1]), base + used
         used += len(found[-1])
-    return np.concatenate(found) if len(found) > 1 else t
+    return np.concatenate(found)
 
 
 def _cross_alone(

@@ -28,7 +28,7 @@ EMITTERS = {
     "vectors.py",
     "stride.py",
     "along.py",
-}  # these write the processor's vectors themselves (decisions 0007, 0008)
+}  # these write the processor's vectors themselves (decisions 0007 to 0009)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "hhsr" / "kernels").glob("*.py")), ids=lambda p: p.name)

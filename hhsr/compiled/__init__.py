@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from hhsr.compiled.blob import read_only
+from hhsr.compiled.blob import read_only, room
 from hhsr.compiled.proofs import BandTables, Proofs
 from hhsr.compiled.records import pose_arrays
 from hhsr.kernels import layout as at
@@ -39,7 +39,8 @@ class Compiled:
 
     def moved(self, pose: FloatArray) -> Compiled:
         """Return the same under another pose (6,): nothing is proven again."""
-        blob = self.blob.copy()
+        blob = room(self.blob.size)
+        blob[:] = self.blob
         start = int(self.layout.header(blob)[at.POSE])
         blob[start : start + 12] = pose_arrays(pose)
         blob.setflags(write=False)

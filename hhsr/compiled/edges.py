@@ -74,8 +74,9 @@ def _edge_pieces(
     shifts = EDGE_OFFSET * np.array([n + m, n - m, m - n, -n - m])
     counts, places, begins = np.empty(4, np.int64), np.empty(4, np.int64), np.empty(4, np.bool_)
     t = cross_segments(
-        blob_view, start + shifts, end + shifts, False, EDGE_RESOLUTION, EDGE_RESOLUTION, counts, begins, places
-    )
+        blob_view, start + shifts, end + shifts, np.arange(4), False, EDGE_RESOLUTION, EDGE_RESOLUTION, counts, begins,
+        places,
+    )  # fmt: skip
     stops = np.concatenate([[0.0], np.sort(t), [1.0]])
     pieces = []
     for a, b in pairwise(stops):

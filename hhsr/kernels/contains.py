@@ -19,7 +19,7 @@ def contains_one(blob, x, y, z):
     if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
         return INVALID
     x, y, z = into_tree(blob, ints, x, y, z)
-    state = voxel_state(blob, ints, tab, blob.view(np.uint8), blob.view(np.int32), x, y, z) if ints[VOXELS] != 0 else 0
+    state = voxel_state(blob, ints, tab, blob.view(np.int16), blob.view(np.int32), x, y, z) if ints[VOXELS] != 0 else 0
     if state == 0:
         return INSIDE if contains_point(blob, ints, tab, 0, x, y, z) else OUTSIDE
     return INSIDE if state > 0 else OUTSIDE
@@ -29,7 +29,7 @@ def contains_one(blob, x, y, z):
 def contains_many(blob, points, out):
     """Fill (n,) int8 with 1 inside, 0 outside, −1 not finite; return how many are not finite."""
     ints, tab = integers(blob), tables(blob)
-    octets, words = blob.view(np.uint8), blob.view(np.int32)
+    shorts, words = blob.view(np.int16), blob.view(np.int32)
     grid = ints[VOXELS] != 0
     bad = 0
     for i in range(points.shape[0]):
@@ -40,7 +40,7 @@ def contains_many(blob, points, out):
                 bad += 1
                 continue
         x, y, z = into_tree(blob, ints, x, y, z)
-        state = voxel_state(blob, ints, tab, octets, words, x, y, z) if grid else 0
+        state = voxel_state(blob, ints, tab, shorts, words, x, y, z) if grid else 0
         if state == 0:
             out[i] = INSIDE if contains_point(blob, ints, tab, 0, x, y, z) else OUTSIDE
         else:

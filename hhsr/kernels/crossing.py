@@ -11,8 +11,9 @@ from numba import njit
 from hhsr.kernels.clipped import follow_tree, merge_touches
 from hhsr.kernels.lane import BEGIN, FIRST_RUN, GAP, LAST_RUN, MERGE, ROWS, RUNS_USED, SPILLED, set_out
 from hhsr.kernels.layout import VOXELS, integers, tables
-from hhsr.kernels.runs import CODE, MONOTONE, RUN_SIZE, make_ready, settle_run
+from hhsr.kernels.runs import HALVINGS, RUN_SIZE, make_ready
 from hhsr.kernels.segment import PIECES, emit
+from hhsr.kernels.settle_run import settle_run
 from hhsr.kernels.tree import into_tree
 from hhsr.kernels.unmanaged import unmanaged
 from hhsr.kernels.vectors import LANES
@@ -29,7 +30,7 @@ def scratch():
 
     Rows of work: PIECES for bisections, ROWS for lanes, the rest for the runs of a segment that walks alone.
     """
-    work = np.empty((PIECES + ROWS + RUNS * RUN_SIZE // LANES, LANES))
+    work = np.empty((PIECES + ROWS + (RUNS + HALVINGS) * RUN_SIZE // LANES, LANES))
     work[PIECES : PIECES + ROWS] = 0.0
     return work, np.empty((SLOTS, 2)), np.empty(SLOTS, dtype=np.int64)
 
@@ -39,21 +40,21 @@ def _walk(
     blob, ints, tab, px, py, pz, ex, ey, ez, length, resolution, tolerance, first, out, work, slots, pending
 ):  # fmt: skip
     """Return (start state, count) of a segment of some length by the walk of the voxels; count −1: too many runs."""
-    lanes, runs = work[PIECES : PIECES + ROWS], work[PIECES + ROWS :].reshape(RUNS, RUN_SIZE)
+    lanes, runs = work[PIECES : PIECES + ROWS], work[PIECES + ROWS :].reshape(RUNS + HALVINGS, RUN_SIZE)
     if not set_out(blob, ints, lanes, 0, px, py, pz, ex, ey, ez, length):
         return False, np.int64(0)
     lanes[RUNS_USED, 0] = 0.0
     gap, count, done = lanes[GAP, 0], np.int64(0), False
     while not done:
-        done = go_on(blob, ints, tab, lanes, np.int64(0), first, np.bool_(True), runs)
+        done = go_on(blob, ints, tab, lanes, np.int64(0), first, np.bool_(True), runs[:RUNS])
         if lanes[SPILLED, 0] > 0.0:
             return False, np.int64(-1)
         for run in range(int(lanes[RUNS_USED, 0])):
-            if int(runs[run, CODE]) & 7 == MONOTONE:
-                make_ready(blob, ints, runs, np.int64(run))
+            make_ready(blob, ints, runs, np.int64(run))
             count = settle_run(
-                blob, ints, tab, runs, np.int64(run), resolution, tolerance, gap, out, count, work, slots, pending
-            )
+                blob, ints, tab, runs, np.int64(run), np.int64(RUNS), resolution, tolerance, gap, out, count, work,
+                slots, pending,
+            )  # fmt: skip
         lanes[RUNS_USED, 0], lanes[FIRST_RUN, 0], lanes[LAST_RUN, 0] = 0.0, -1.0, -1.0
     return lanes[BEGIN, 0] > 0.0, min(count, np.int64(1)) if first else count
 

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 SIDE = 32
+SAMPLE = 16  # the box is that of every so many-th row: others beyond it go to its outermost cells
 CELLS = SIDE**3
 
 
@@ -17,17 +18,22 @@ def _spread(i):
     return (i | (i << 2)) & 0x1249
 
 
+@njit(cache=True, error_model="numpy")
+def _cell(x):
+    return int(min(max(x, 0.0), SIDE - 1.0))
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def order_along_curve(points, keys, order):
-    """Fill order (n,) with the rows of points (n, 3): cell after cell of their box, as they came within one.
+def order_along_curve(points, others, keys, order):
+    """Fill order (n,) with the rows of points (n, 3) + others (n, 3): cell after cell of their box, as they came in.
 
     keys: (n,) int32 scratch. A row that is not finite is put into the first cell.
     """
     n = points.shape[0]
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for i in range(n):
+    for i in range(0, n, SAMPLE):
         for k in range(3):
-            x = points[i, k]
+            x = points[i, k] + others[i, k]
             if math.isfinite(x):
                 low[k], high[k] = min(low[k], x), max(high[k], x)
     scale = np.empty(3)
@@ -35,10 +41,12 @@ def order_along_curve(points, keys, order):
         scale[k] = (SIDE - 1e-6) / max(high[k] - low[k], 1e-300)
     ends = np.zeros(CELLS + 1, dtype=np.int64)
     for i in range(n):
-        x, y, z = points[i, 0] - low[0], points[i, 1] - low[1], points[i, 2] - low[2]
+        x, y, z = points[i, 0] + others[i, 0], points[i, 1] + others[i, 1], points[i, 2] + others[i, 2]
+        x, y, z = x - low[0], y - low[1], z - low[2]
         key = 0
         if math.isfinite(x + y + z):
-            key = (_spread(int(x * scale[0])) << 2) | (_spread(int(y * scale[1])) << 1) | _spread(int(z * scale[2]))
+            a, b, c = _cell(x * scale[0]), _cell(y * scale[1]), _cell(z * scale[2])
+            key = (_spread(a) << 2) | (_spread(b) << 1) | _spread(c)
         keys[i] = key
         ends[key + 1] += 1
     for c in range(CELLS):

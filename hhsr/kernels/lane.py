@@ -1,6 +1,6 @@
 """A segment's walk through the voxels as a column of numbers: so that several can be under way side by side.
 
-All in voxels from the grid's lowest corner on, the segment being u + t·v. LANES segments share a table of ROWS rows,
+All in voxels from the grid's lowest corner on, the segment being u + t·v. ABREAST segments share a table of ROWS rows,
 one column each; what the strides of all of them (`hhsr.kernels.stride`) read comes first.
 """
 
@@ -10,24 +10,25 @@ import numpy as np
 
 from hhsr.kernels.layout import VOXEL_FRAME, VOXELS
 from hhsr.kernels.unmanaged import inlined
-from hhsr.kernels.voxels import BRICK, LEAPS, OCTANT_WORDS, STEPS
+from hhsr.kernels.voxels import BRICK
 
 # u, v; along an axis the border at x is met at t = x·inverse + shift, a still axis never; the sign of v, and 1 where it
 # is negative; t, where it stops, how far past a border it goes on; the state it is in, −1 where that is not known yet;
-# where the octant's tables begin.
+# the octant of its direction.
 U, V, INVERSE, SHIFT, SIGN, BACK = 0, 3, 6, 9, 12, 15
-T, STOP, NUDGED, STATE, LEAP_TABLE, STEP_TABLE = 18, 19, 20, 21, 22, 23
+T, STOP, NUDGED, STATE, OCTANT = 18, 19, 20, 21, 22
 # Tree's frame, mm: start, end. MERGE as a share of the segment; |v|. The start's state; whether a proven voxel's state
 # stands up to t; the owner of the last voxel, where a cut passed it, else −1; the t it was left at; the number of the
 # segment, −1 of an empty lane.
-START, END, GAP, SPEED, BEGIN, SURE, LAST, LEFT_AT, SEGMENT = 24, 27, 30, 31, 32, 33, 34, 35, 36
+START, END, GAP, SPEED, BEGIN, SURE, LAST, LEFT_AT, SEGMENT = 23, 26, 29, 30, 31, 32, 33, 34, 35
 # Runs (`hhsr.kernels.runs`): the segment's first and last, −1 if none; t up to which the state surely changed, infinite
 # if it did not; whether there was no room for one; in lane 0, how many all lanes have.
-FIRST_RUN, LAST_RUN, FOUND, SPILLED, RUNS_USED = 37, 38, 39, 40, 41
+FIRST_RUN, LAST_RUN, FOUND, SPILLED, RUNS_USED = 36, 37, 38, 39, 40
 # Of the voxel that the last stride did not take, where its plane leaves the state open: number of the surfel (else −1),
 # the plane's value at t and change by t, and where the segment leaves the voxel.
-SURFEL, DEPTH, SLOPE, EXIT, ROWS = 42, 43, 44, 45, 46
+SURFEL, DEPTH, SLOPE, EXIT, ROWS = 41, 42, 43, 44, 45
 
+ABREAST = 16  # segments whose strides are taken together
 MERGE = 1e-9  # mm: a leaving and an entering closer than this are one touch
 NUDGE = 1e-7  # mm (and voxels) past a voxel's border: less than voxels and planes are proven beyond theirs
 STILL = 1e-12  # voxels: along an axis, a segment that moves less stays where it is
@@ -70,8 +71,7 @@ def set_out(blob, ints, lanes, lane, px, py, pz, qx, qy, qz, length):
     lanes[T, lane], lanes[STOP, lane], lanes[NUDGED, lane] = t, stop, nudge
     begun = start > 0.0  # from outside of the grid
     lanes[STATE, lane], lanes[BEGIN, lane] = 0.0 if begun else -1.0, 0.0
-    lanes[LEAP_TABLE, lane] = ints[c + LEAPS] + octant * (nx * ny * nz)
-    lanes[STEP_TABLE, lane] = ints[c + STEPS] + octant * ints[c + OCTANT_WORDS]
+    lanes[OCTANT, lane] = octant
     lanes[START, lane], lanes[START + 1, lane], lanes[START + 2, lane] = px, py, pz
     lanes[END, lane], lanes[END + 1, lane], lanes[END + 2, lane] = qx, qy, qz
     lanes[GAP, lane] = MERGE * once

@@ -38,14 +38,17 @@ from hhsr.kernels.unmanaged import unmanaged
 
 # A surfel: over its voxel, in voxel units u from its centre, F − 1 = thick·(normal·u + offset ± 1), so that the plane
 # decides where |normal·u + offset| > 1; the gradient of F strays no more than `turn` from the plane's; |second
-# derivative of F along a unit vector| ≤ bend (infinite: unknown). The first four numbers lie apart: most need no more.
-# A voxel that one cutting plane passes has no normal (NaN), owner = −1 − the cut's node, and at EXTRA where the surfels
-# of its two sides lie, left and right.
+# derivative of F along a unit vector| ≤ bend (infinite: unknown). The first four numbers are the plane, the others its
+# details, which lie apart: most need no more.
+# A voxel that one cutting plane passes has owner = −1 − the cut's node, and at EXTRA where the surfels of its two sides
+# lie, left and right; its own plane decides for both, or is NaN.
 PLANE_SIZE, DETAIL_SIZE = 4, 4
 SURFEL_SIZE = PLANE_SIZE + DETAIL_SIZE
 NORMAL, OFFSET, DETAIL = 0, 3, 4
 THICK, TURN, BEND, SURFEL_OWNER = 0, 1, 2, 3  # from DETAIL on
 EXTRA = 0
+# What is kept of a plane: four 16-bit numbers, its own times FINE, rounded; no plane: zeros.
+FINE, LARGEST = 256.0, 32_742.0
 SURE = 2.0  # offset where a side is proven whole
 MOST_CELLS = 2000  # a box that sweeps more is too near its leaf's centre
 WILD = 1e3  # a model that strays more (1/mm) proves nothing worth keeping
@@ -230,6 +233,53 @@ def _prove_side(blob, ints, tab, owner, x, y, z, half, side, nx, ny, nz, c, q, e
 
 
 @unmanaged
+def _farthest(gx, gy, gz, level, nx, ny, nz, c, half):
+    """Return an upper bound of |g·u + level| over the cube |u|∞ ≤ half where n·u ≤ c."""
+    return max(level + _highest(gx, gy, gz, nx, ny, nz, c, half), _highest(-gx, -gy, -gz, nx, ny, nz, c, half) - level)
+
+
+@unmanaged
+def _join(left, right, nx, ny, nz, c, half, margin, out):
+    """Put a plane into out that decides for both sides of the cut n·u = c, by those of its sides; NaN: there is none.
+
+    In lengths: where a side's plane puts the surface within 1/|normal|, the middle of both does within that and how far
+    it strays from the side's own. Where one side is proven whole the other's plane must not say the contrary there.
+    margin: so far past the cut a side counts.
+    """
+    out[NORMAL : OFFSET + 1] = np.nan
+    ax, ay, az, a = np.float64(left[0]), np.float64(left[1]), np.float64(left[2]), np.float64(left[OFFSET])
+    bx, by, bz, b = np.float64(right[0]), np.float64(right[1]), np.float64(right[2]), np.float64(right[OFFSET])
+    one, other = math.sqrt(ax * ax + ay * ay + az * az), math.sqrt(bx * bx + by * by + bz * bz)
+    if one > 0.0 and other > 0.0:
+        ax, ay, az, a = ax / one, ay / one, az / one, a / one
+        bx, by, bz, b = bx / other, by / other, bz / other, b / other
+        gx, gy, gz, level = 0.5 * (ax + bx), 0.5 * (ay + by), 0.5 * (az + bz), 0.5 * (a + b)
+        thick = max(
+            1.0 / one + _farthest(gx - ax, gy - ay, gz - az, level - a, nx, ny, nz, c + margin, half),
+            1.0 / other + _farthest(gx - bx, gy - by, gz - bz, level - b, -nx, -ny, -nz, margin - c, half),
+        )
+        steep = abs(gx) + abs(gy) + abs(gz)
+        thick = (thick + 1e-6 * (steep + abs(level))) * (1.0 + 1e-6)
+        if thick < steep * half:
+            out[NORMAL], out[NORMAL + 1], out[NORMAL + 2] = gx / thick, gy / thick, gz / thick
+            out[OFFSET] = level / thick
+    elif other > 0.0:
+        whole = 1.0 if a > 0.0 else -1.0
+        if _highest(-whole * bx, -whole * by, -whole * bz, nx, ny, nz, c + margin, half) - whole * b < 1.0 - 1e-6 * (
+            1.0 + other
+        ):
+            for k in range(DETAIL):
+                out[k] = right[k]
+    elif one > 0.0:
+        whole = 1.0 if b > 0.0 else -1.0
+        if _highest(-whole * ax, -whole * ay, -whole * az, -nx, -ny, -nz, margin - c, half) - whole * a < 1.0 - 1e-6 * (
+            1.0 + one
+        ):
+            for k in range(DETAIL):
+                out[k] = left[k]
+
+
+@unmanaged
 def prove_voxel(blob, ints, tab, x, y, z, half, side, q, e, acc, plane, out, left, right):
     """Return IN, OUT or MIXED of the cube about (x, y, z), half a side in mm, by its surfel; −1 where it has none.
 
@@ -256,19 +306,18 @@ def prove_voxel(blob, ints, tab, x, y, z, half, side, q, e, acc, plane, out, lef
     )
     if one < 0 or other < 0:
         return -1
-    # A millionth of a voxel past the cut: where a segment meets it is rounded.
-    state = _prove_side(
-        blob, ints, tab, one, x, y, z, half, side, nx, ny, nz, c + 1e-6 * (1.0 + abs(c)), q, e, acc, plane, left
-    )
+    margin = 1e-6 * (1.0 + abs(c))  # a millionth of a voxel past the cut: where a segment meets it is rounded
+    state = _prove_side(blob, ints, tab, one, x, y, z, half, side, nx, ny, nz, c + margin, q, e, acc, plane, left)
     if state < 0:
         return -1
     second = _prove_side(
-        blob, ints, tab, other, x, y, z, half, side, -nx, -ny, -nz, -c + 1e-6 * (1.0 + abs(c)), q, e, acc, plane, right
+        blob, ints, tab, other, x, y, z, half, side, -nx, -ny, -nz, margin - c, q, e, acc, plane, right
     )
     if second < 0:
         return -1
     if state == second and state != MIXED:
         return state
     out[:] = np.nan
+    _join(left, right, nx, ny, nz, c, half / side, margin, out)
     out[DETAIL + SURFEL_OWNER] = owner
     return MIXED

@@ -1,7 +1,7 @@
 """Vectors of numbers in formulas, for kernels that a compiler finds none in: each operation emits one instruction.
 
-Used while numba compiles an intrinsic. A vector of LANES doubles, 32-bit integers or truths; a plain number in a
-formula stands for all lanes.
+Used while numba compiles an intrinsic. A vector of doubles, integers or truths; a plain number in a formula stands for
+all lanes.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, overload
 
-LANES = 8
-DOUBLE, FLOAT, LONG, INT = ir.DoubleType(), ir.FloatType(), ir.IntType(64), ir.IntType(32)
+LANES = 8  # of a vector, where nothing else is said
+DOUBLE, FLOAT, LONG, INT, SHORT = ir.DoubleType(), ir.FloatType(), ir.IntType(64), ir.IntType(32), ir.IntType(16)
 
 
 def _wide(element: Any, lanes: int = LANES) -> Any:
@@ -21,21 +21,22 @@ def _wide(element: Any, lanes: int = LANES) -> Any:
 
 
 class Vector:
-    """LANES values while code is emitted by a builder of LLVM's."""
+    """Some values, one a lane, while code is emitted by a builder of LLVM's."""
 
     def __init__(self, builder: Any, value: Any) -> None:
         self.builder, self.value = builder, value
+        self.lanes = value.type.count
         self.floats = isinstance(value.type.element, (ir.DoubleType, ir.FloatType))
 
     @classmethod
-    def of(cls, builder: Any, element: Any) -> Vector:
+    def of(cls, builder: Any, element: Any, lanes: int = LANES) -> Vector:
         """Return one value of the emitted code in all lanes."""
-        none = ir.Constant(_wide(element.type), ir.Undefined)
+        none = ir.Constant(_wide(element.type, lanes), ir.Undefined)
         first = builder.insert_element(none, element, ir.Constant(INT, 0))
-        return cls(builder, builder.shuffle_vector(first, none, ir.Constant(_wide(INT), [0] * LANES)))
+        return cls(builder, builder.shuffle_vector(first, none, ir.Constant(_wide(INT, lanes), [0] * lanes)))
 
     def _right(self, other: Vector | float) -> Any:
-        return other.value if isinstance(other, Vector) else ir.Constant(self.value.type, [other] * LANES)
+        return other.value if isinstance(other, Vector) else ir.Constant(self.value.type, [other] * self.lanes)
 
     def _emit(self, name: str, other: Vector | float) -> Vector:
         return Vector(self.builder, getattr(self.builder, name)(self.value, self._right(other)))
@@ -73,8 +74,8 @@ class Vector:
 
     def __abs__(self) -> Vector:
         """Return the sizes of doubles."""
-        bits = self.builder.bitcast(self.value, _wide(LONG))
-        bits = self.builder.and_(bits, ir.Constant(_wide(LONG), [0x7FFFFFFFFFFFFFFF] * LANES))
+        bits = self.builder.bitcast(self.value, _wide(LONG, self.lanes))
+        bits = self.builder.and_(bits, ir.Constant(_wide(LONG, self.lanes), [0x7FFFFFFFFFFFFFFF] * self.lanes))
         return Vector(self.builder, self.builder.bitcast(bits, self.value.type))
 
     def _compare(self, sign: str, other: Vector | float) -> Vector:
@@ -103,28 +104,53 @@ class Vector:
 
     def doubles(self) -> Vector:
         """Return integers, floats or truths (0 and 1) as doubles."""
-        kind = _wide(DOUBLE)
+        kind = _wide(DOUBLE, self.lanes)
         if self.floats:
             return Vector(self.builder, self.builder.fpext(self.value, kind))
         truths = self.value.type.element.width == 1
         return Vector(self.builder, (self.builder.uitofp if truths else self.builder.sitofp)(self.value, kind))
 
+    def wide(self) -> Vector:
+        """Return 16-bit integers as 32-bit ones."""
+        return Vector(self.builder, self.builder.sext(self.value, _wide(INT, self.lanes)))
+
+    def halves(self) -> tuple[Vector, Vector]:
+        """Return the lower and the upper 16 bits of integers, as integers with a sign."""
+        lower, upper = (
+            Vector(self.builder, self.builder.ashr(half, self._right(16))) for half in ((self << 16).value, self.value)
+        )
+        return lower, upper
+
+    def some(self, first: int, lanes: int) -> Vector:
+        """Return so many lanes from a first one on."""
+        places = ir.Constant(_wide(INT, lanes), list(range(first, first + lanes)))
+        return Vector(self.builder, self.builder.shuffle_vector(self.value, self.value, places))
+
     def integers(self) -> Vector:
         """Return doubles as integers, towards 0."""
-        return Vector(self.builder, self.builder.fptosi(self.value, _wide(INT)))
+        return Vector(self.builder, self.builder.fptosi(self.value, _wide(INT, self.lanes)))
 
     def bits(self) -> Any:
         """Return truths as one 64-bit integer, lane 0 the lowest bit."""
-        packed = self.builder.bitcast(self.value, ir.IntType(LANES))
+        packed = self.builder.bitcast(self.value, ir.IntType(self.lanes))
         return self.builder.zext(packed, LONG)
 
 
 def fused(factor: Vector, other: Vector | float, more: Vector | float) -> Vector:
     """Return factor·other + more of doubles, rounded once."""
     kind = factor.value.type
-    function = _intrinsic(factor.builder, f"llvm.fma.v{LANES}f64", kind, [kind] * 3)
+    function = _intrinsic(factor.builder, f"llvm.fma.v{factor.lanes}f64", kind, [kind] * 3)
     return Vector(
         factor.builder, factor.builder.call(function, [factor.value, factor._right(other), factor._right(more)])
+    )
+
+
+def root(number: Vector) -> Vector:
+    """Return the square root of doubles, correctly rounded."""
+    kind = number.value.type
+    return Vector(
+        number.builder,
+        number.builder.call(_intrinsic(number.builder, f"llvm.sqrt.v{number.lanes}f64", kind, [kind]), [number.value]),
     )
 
 
@@ -133,19 +159,14 @@ def _intrinsic(builder: Any, name: str, result: Any, kinds: list[Any]) -> Any:
     return builder.module.globals.get(name) or ir.Function(builder.module, ir.FunctionType(result, kinds), name)
 
 
-def power_of_two(bits: Vector) -> Vector:
-    """Return 2^bits of integers."""
-    return Vector(bits.builder, bits.builder.shl(bits._right(1), bits.value))
-
-
-def load(builder: Any, table: Any, first: int) -> Vector:
-    """Return LANES numbers in a row from a number of elements on."""
+def load(builder: Any, table: Any, first: int, lanes: int = LANES) -> Vector:
+    """Return so many numbers in a row from a number of elements on."""
     at = builder.gep(table, [ir.Constant(LONG, first)])
-    return Vector(builder, builder.load(builder.bitcast(at, _wide(table.type.pointee).as_pointer()), align=8))
+    return Vector(builder, builder.load(builder.bitcast(at, _wide(table.type.pointee, lanes).as_pointer()), align=8))
 
 
 def store(builder: Any, vector: Vector, table: Any, first: int) -> None:
-    """Put LANES numbers into a table from a number of elements on."""
+    """Put a vector's numbers into a table from a number of elements on."""
     at = builder.gep(table, [ir.Constant(LONG, first)])
     builder.store(vector.value, builder.bitcast(at, vector.value.type.as_pointer()), align=8)
 
@@ -158,31 +179,31 @@ def _lane(builder: Any, table: Any, index: Vector, k: int) -> Any:
 
 def gather(builder: Any, table: Any, index: Vector) -> Vector:
     """Return the table's element at each lane's index."""
-    value = ir.Constant(_wide(table.type.pointee), ir.Undefined)
-    for k in range(LANES):
+    value = ir.Constant(_wide(table.type.pointee, index.lanes), ir.Undefined)
+    for k in range(index.lanes):
         value = builder.insert_element(value, builder.load(_lane(builder, table, index, k)), ir.Constant(INT, k))
     return Vector(builder, value)
 
 
-def gather_four(builder: Any, table: Any, index: Vector) -> list[Vector]:
-    """Return the four floats from each lane's index on, as four vectors of doubles."""
-    four = _wide(FLOAT, 4).as_pointer()
-    rows = [builder.load(builder.bitcast(_lane(builder, table, index, k), four), align=4) for k in range(LANES)]
-    size = 4
+def gather_rows(builder: Any, table: Any, index: Vector, size: int) -> list[Vector]:
+    """Return the `size` (a power of two) elements from each lane's index on, as so many vectors."""
+    row = _wide(table.type.pointee, size).as_pointer()
+    rows = [builder.load(builder.bitcast(_lane(builder, table, index, k), row), align=4) for k in range(index.lanes)]
+    wide = size
     while len(rows) > 1:
-        size *= 2
-        both = ir.Constant(_wide(INT, size), list(range(size)))
+        wide *= 2
+        both = ir.Constant(_wide(INT, wide), list(range(wide)))
         rows = [builder.shuffle_vector(rows[k], rows[k + 1], both) for k in range(0, len(rows), 2)]
-    columns = ([4 * k + c for k in range(LANES)] for c in range(4))
+    columns = ([size * k + c for k in range(index.lanes)] for c in range(size))
     return [
-        Vector(builder, builder.shuffle_vector(rows[0], rows[0], ir.Constant(_wide(INT), column))).doubles()
+        Vector(builder, builder.shuffle_vector(rows[0], rows[0], ir.Constant(_wide(INT, index.lanes), column)))
         for column in columns
     ]
 
 
 def fetch_ahead(builder: Any, table: Any, index: Vector) -> None:
     """Ask for the table's elements at each lane's index, to be near when they are read: no read waits for them."""
-    for k in range(LANES):
+    for k in range(index.lanes):
         _fetch(builder, _lane(builder, table, index, k))
 
 

@@ -2,8 +2,9 @@
 
 Voxels come in bricks of 4³. A brick that is proven whole has a leap for each octant of directions: the greatest cube of
 bricks, from it on that way, in which nothing changes. The others have a plane (`hhsr.kernels.surfel`) that decides most
-of the brick, and each of their voxels a byte: the number of its own surfel in the brick; or that it is proven. Proven
-voxels have, for each octant of directions, a leap too: a cube of voxels, from it on that way, in which nothing changes.
+of the brick, and each of their voxels a number: that of its own surfel; or that it is proven, and for each octant of
+directions a leap too: a cube of voxels, from it on that way, in which nothing changes. So what a walk asks of a brick,
+and what it asks of a voxel, lies in one place each.
 """
 
 import math
@@ -17,6 +18,7 @@ from hhsr.kernels.surfel import (
     DETAIL,
     DETAIL_SIZE,
     EXTRA,
+    FINE,
     OFFSET,
     PLANE_SIZE,
     SURE,
@@ -31,15 +33,18 @@ from hhsr.kernels.unmanaged import inlined, unmanaged
 BRICK = 4  # voxels a side
 COARSE = 8  # bricks a side of the first cubes that are tried
 NODES = 256
-# The grid's record, integer slots: bricks along x, y, z; then where its tables begin: octants' leaps (bytes), bricks
-# (32 bits: the number of a brick with voxels; −1 inside, −2 outside), of bricks with voxels the first surfel (32 bits),
-# the 64 bytes, the brick's own plane (float32 slot); of surfels the planes and the details (float32 slots); of bricks
-# with voxels the leaps of these (STEP_WORDS of 32 bits; those of the next octant OCTANT_WORDS on).
-LEAPS, BRICKS, BASES, BYTES, BRICK_PLANES, PLANES, DETAILS, STEPS, OCTANT_WORDS = 3, 4, 5, 6, 7, 8, 9, 10, 11
-VOXEL_INTS = 12
-INSIDE_BRICK, OUTSIDE_BRICK = -1, -2
-NO_SURFEL, IN_BYTE, OUT_BYTE = 64, 65, 66  # a byte: 0 … 63 a surfel of the brick; none; proven inside; outside
-STEP_WORDS, STEP_BITS, FARTHEST_STEP = 4, 2, 3  # a voxel's leap: 2^bits voxels
+# The grid's record, integer slots: bricks along x, y, z; then where its tables begin: bricks (32-bit words), voxels (16
+# bits each), planes of surfels (16 bits), their details (float32 slots).
+BRICKS, VOXELS_AT, PLANES, DETAILS = 3, 4, 5, 6
+VOXEL_INTS = 7
+# A brick, 32-bit words: two of its own plane (four 16-bit numbers), or, where it is proven, of eight bytes, the leap of
+# each octant, < 0 outside; where its voxels begin, counted from the table's begin on, −1 where it is proven; the number
+# of its first surfel.
+BRICK_SIZE, BRICK_VOXELS, BRICK_SURFEL = 4, 2, 3
+# A voxel: 0 … 63 the number of its surfel in the brick; NO_SURFEL; or negative: proven, inside where IN_BIT is set. Its
+# leap is then one of two, by the octant's bit: the number of STEP_BITS from bit SHORT_BITS on, or the next, + 1.
+NO_SURFEL, PROVEN, IN_BIT = 64, -(2**15), 1 << 14
+SHORT_BITS, STEP_BITS, FARTHEST_STEP = 8, 3, 7
 LONGEST = 127  # bricks
 
 
@@ -84,17 +89,18 @@ def _prove_brick(blob, ints, tab, low, side, brick, q, e, acc, plane, out, left,
     y = low[1] + side * BRICK * (brick[1] + 0.5)
     z = low[2] + side * BRICK * (brick[2] + 0.5)
     state = prove_voxel(blob, ints, tab, x, y, z, 0.5 * BRICK * side, side, q, e, acc, plane, out, left, right)
-    if state != MIXED or out[DETAIL + SURFEL_OWNER] < 0:
+    if state != MIXED or math.isnan(out[OFFSET]):
         out[:] = 0.0
     if state == IN or state == OUT:
         out[OFFSET] = -SURE if state == IN else SURE
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_voxels(blob, low, side, bricks, octets, bases, planes, surfels, extras):
+def fill_voxels(blob, low, side, bricks, voxels, bases, planes, surfels, extras):
     """Prove the voxels, of side `side`, of bricks (n, 3) one by one; return how many surfels and extras there are.
 
-    octets: (n, 64) bytes. bases: (n,) the first surfel of each brick. planes: (n, SURFEL_SIZE) float32 the brick's own.
+    voxels: (n, 64) int16, leaps of 1. bases: (n,) the first surfel of each brick. planes: (n, SURFEL_SIZE) float32 the
+    brick's own.
     surfels: (64 n + 1, SURFEL_SIZE) float32, extras: twice that, room for all that there may be.
     """
     ints, tab = integers(blob), tables(blob)
@@ -113,7 +119,7 @@ def fill_voxels(blob, low, side, bricks, octets, bases, planes, surfels, extras)
             for d in range(8):
                 i1, j1, k1 = d >> 2, (d >> 1) & 1, d & 1
                 state = block
-                byte = NO_SURFEL
+                voxel = NO_SURFEL
                 if state == MIXED:
                     x = low[0] + side * (bi + i1 + 0.5)
                     y = low[1] + side * (bj + j1 + 0.5)
@@ -126,13 +132,13 @@ def fill_voxels(blob, low, side, bricks, octets, bases, planes, surfels, extras)
                             surfels[used, DETAIL + EXTRA] = extra
                             extras[extra], extras[extra + 1] = left, right
                             extra += 2
-                        byte = used - bases[n]
+                        voxel = used - bases[n]
                         used += 1
                     elif state < 0:
                         state = box_state(blob, ints, tab, x, y, z, 0.5 * side, nodes, stack, q, e)
                 if state != MIXED:
-                    byte = IN_BYTE if state == IN else OUT_BYTE  # a leap of 1
-                octets[n, 16 * (i + i1) + 4 * (j + j1) + k + k1] = byte
+                    voxel = PROVEN + (IN_BIT if state == IN else 0)
+                voxels[n, 16 * (i + i1) + 4 * (j + j1) + k + k1] = voxel
     return used, extra
 
 
@@ -178,11 +184,32 @@ def fill_octant(states, octant, out):
                 out[i, j, k] = state * (max(best, 0) + 1)
 
 
+@inlined
+def state_of(voxel):
+    """Return 1 inside, −1 outside, 0 not proven."""
+    if voxel >= 0:
+        return 0
+    return 1 if voxel & IN_BIT else -1
+
+
+@inlined
+def step_of(voxel, octant):
+    """Return the leap of a proven voxel, in voxels, less 1."""
+    return (voxel >> (SHORT_BITS + STEP_BITS * ((voxel >> octant) & 1))) & FARTHEST_STEP
+
+
+@inlined
+def leap_of(words, brick, octant):
+    """Return the leap of a proven brick, in bricks: < 0 outside."""
+    leap = (np.int64(words[brick + (octant >> 2)]) >> (8 * (octant & 3))) & 255
+    return leap if leap < 128 else leap - 256
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def state_voxels(bricks, octets, out):
+def state_voxels(bricks, voxels, out):
     """Fill out (4·nx, 4·ny, 4·nz) int8 of bricks (nx, ny, nz) int8: 1 inside, −1 outside, 0 neither.
 
-    octets: (n, 64) bytes of the bricks that are 0, in their order.
+    voxels: (n, 64) int16, those of the bricks that are 0, in their order.
     """
     slot = -1
     for bi in range(bricks.shape[0]):
@@ -192,40 +219,44 @@ def state_voxels(bricks, octets, out):
                 slot += 1 if state == 0 else 0
                 for v in range(64):
                     if bricks[bi, bj, bk] == 0:
-                        byte = octets[slot, v]
-                        state = 1 if byte == IN_BYTE else (-1 if byte == OUT_BYTE else 0)
+                        state = state_of(np.int64(voxels[slot, v]))
                     out[BRICK * bi + (v >> 4), BRICK * bj + ((v >> 2) & 3), BRICK * bk + (v & 3)] = state
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_steps(bricks, leaps, out):
-    """Fill out (n, STEP_WORDS) uint32 with the leaps (4·nx, 4·ny, 4·nz) int8 of one octant; bricks: `state_voxels`."""
+    """Fill out (n, 64) int8 with the leaps (4·nx, 4·ny, 4·nz) int8 of one octant, less 1, by voxel."""
     slot = 0
     for bi in range(bricks.shape[0]):
         for bj in range(bricks.shape[1]):
             for bk in range(bricks.shape[2]):
                 if bricks[bi, bj, bk] != 0:
                     continue
-                for w in range(STEP_WORDS):
-                    word = np.uint32(0)
-                    for k in range(16):
-                        v = 16 * w + k
-                        leap = abs(
-                            np.int64(leaps[BRICK * bi + (v >> 4), BRICK * bj + ((v >> 2) & 3), BRICK * bk + (v & 3)])
-                        )
-                        step = 0
-                        while step < FARTHEST_STEP and leap >= 2 << step:
-                            step += 1
-                        word |= np.uint32(step) << np.uint32(STEP_BITS * k)
-                    out[slot, w] = word
+                for v in range(64):
+                    leap = leaps[BRICK * bi + (v >> 4), BRICK * bj + ((v >> 2) & 3), BRICK * bk + (v & 3)]
+                    out[slot, v] = min(max(abs(np.int64(leap)) - 1, 0), FARTHEST_STEP)
                 slot += 1
 
 
 @inlined
-def voxel_state(blob, ints, tab, octets, words, x, y, z):
+def level_of(shorts, plane, x, y, z):
+    """Return the value of a plane at a place from its middle, in voxels."""
+    rise = np.float64(shorts[plane]) * x + np.float64(shorts[plane + 1]) * y + np.float64(shorts[plane + 2]) * z
+    return (rise + np.float64(shorts[plane + OFFSET])) * (1.0 / FINE)
+
+
+@inlined
+def rise_of(shorts, plane, x, y, z):
+    """Return what the value of a plane changes by along a way, in voxels."""
+    rise = np.float64(shorts[plane]) * x + np.float64(shorts[plane + 1]) * y + np.float64(shorts[plane + 2]) * z
+    return rise * (1.0 / FINE)
+
+
+@inlined
+def voxel_state(blob, ints, tab, shorts, words, x, y, z):
     """Return 1 inside, −1 outside, 0 not proven, of a point of the tree's frame, by its voxel and its surfel.
 
-    octets, words: the blob as bytes and as 32-bit integers. There must be a grid.
+    shorts, words: the blob as integers of 16 and of 32 bits. There must be a grid.
     """
     c, f = ints[VOXELS], ints[VOXEL_FRAME]
     scale = blob[f + 4]
@@ -233,30 +264,32 @@ def voxel_state(blob, ints, tab, octets, words, x, y, z):
     if not (0.0 <= u < BRICK * ints[c] and 0.0 <= v < BRICK * ints[c + 1] and 0.0 <= w < BRICK * ints[c + 2]):
         return -1
     i, j, k = int(u), int(v), int(w)
-    slot = words[ints[c + BRICKS] + ((i >> 2) * ints[c + 1] + (j >> 2)) * ints[c + 2] + (k >> 2)]
-    if slot < 0:
-        return 1 if slot == INSIDE_BRICK else -1
-    o = ints[c + BRICK_PLANES] + PLANE_SIZE * slot
-    level = tab[o] * (u - ((i | 3) - 1)) + tab[o + 1] * (v - ((j | 3) - 1)) + tab[o + 2] * (w - ((k | 3) - 1))
-    level += tab[o + OFFSET]
+    brick = ints[c + BRICKS] + BRICK_SIZE * (((i >> 2) * ints[c + 1] + (j >> 2)) * ints[c + 2] + (k >> 2))
+    first = np.int64(words[brick + BRICK_VOXELS])
+    if first < 0:
+        return 1 if leap_of(words, brick, np.int64(0)) > 0 else -1
+    level = level_of(shorts, 2 * brick, u - ((i | 3) - 1), v - ((j | 3) - 1), w - ((k | 3) - 1))
     if abs(level) > 1.0:
         return -1 if level > 0.0 else 1
-    byte = octets[ints[c + BYTES] + 64 * slot + (((i & 3) << 4) | ((j & 3) << 2) | (k & 3))]
-    if byte > NO_SURFEL:
-        return 1 if byte < OUT_BYTE else -1
-    if byte == NO_SURFEL:
+    voxel = np.int64(shorts[ints[c + VOXELS_AT] + first + (((i & 3) << 4) | ((j & 3) << 2) | (k & 3))])
+    if voxel < 0:
+        return state_of(voxel)
+    if voxel == NO_SURFEL:
         return 0
-    number = words[ints[c + BASES] + slot] + byte
-    o = ints[c + PLANES] + PLANE_SIZE * number
-    if math.isnan(tab[o + OFFSET]):
+    number = np.int64(words[brick + BRICK_SURFEL]) + voxel
+    level = level_of(shorts, ints[c + PLANES] + PLANE_SIZE * number, u - (i + 0.5), v - (j + 0.5), w - (k + 0.5))
+    if not abs(level) > 1.0:
         d = ints[c + DETAILS] + DETAIL_SIZE * number
-        n = ints[NODE_FLOATS] + NODE_FLOAT_SIZE * (-1 - int(tab[d + SURFEL_OWNER]))
+        owner = int(tab[d + SURFEL_OWNER])
+        if owner >= 0:
+            return 0
+        n = ints[NODE_FLOATS] + NODE_FLOAT_SIZE * (-1 - owner)
         right = blob[n] * x + blob[n + 1] * y + blob[n + 2] * z - blob[n + 3] >= 0.0
-        o = ints[c + PLANES] + PLANE_SIZE * (int(tab[d + EXTRA]) + (1 if right else 0))
-    level = tab[o] * (u - (i + 0.5)) + tab[o + 1] * (v - (j + 0.5)) + tab[o + 2] * (w - (k + 0.5)) + tab[o + OFFSET]
-    if level > 1.0:
-        return -1
-    return 1 if level < -1.0 else 0
+        number = int(tab[d + EXTRA]) + (1 if right else 0)
+        level = level_of(shorts, ints[c + PLANES] + PLANE_SIZE * number, u - (i + 0.5), v - (j + 0.5), w - (k + 0.5))
+        if not abs(level) > 1.0:
+            return 0
+    return -1 if level > 0.0 else 1
 
 
 @unmanaged
@@ -270,19 +303,17 @@ def settled_about(blob, ints, x, y, z):
     if not (0.0 <= u < BRICK * ints[c] and 0.0 <= v < BRICK * ints[c + 1] and 0.0 <= w < BRICK * ints[c + 2]):
         return True  # half a voxel and more beyond the solid
     i, j, k = int(u), int(v), int(w)
-    slot = np.int64(
-        blob.view(np.int32)[ints[c + BRICKS] + ((i >> 2) * ints[c + 1] + (j >> 2)) * ints[c + 2] + (k >> 2)]
-    )
-    if slot < 0:
-        return True
-    return blob.view(np.uint8)[ints[c + BYTES] + 64 * slot + (((i & 3) << 4) | ((j & 3) << 2) | (k & 3))] > NO_SURFEL
+    brick = ints[c + BRICKS] + BRICK_SIZE * (((i >> 2) * ints[c + 1] + (j >> 2)) * ints[c + 2] + (k >> 2))
+    first = np.int64(blob.view(np.int32)[brick + BRICK_VOXELS])
+    inner = ((i & 3) << 4) | ((j & 3) << 2) | (k & 3)
+    return first < 0 or blob.view(np.int16)[ints[c + VOXELS_AT] + first + inner] < 0
 
 
 @unmanaged
 def solid_contains(blob, ints, tab, root, x, y, z):
     """Return whether the solid of node `root` holds a point of the tree's frame: by its voxel, else by the formulas."""
     if root == 0 and ints[VOXELS] != 0:
-        state = voxel_state(blob, ints, tab, blob.view(np.uint8), blob.view(np.int32), x, y, z)
+        state = voxel_state(blob, ints, tab, blob.view(np.int16), blob.view(np.int32), x, y, z)
         if state != 0:
             return state > 0
     return contains_point(blob, ints, tab, root, x, y, z)

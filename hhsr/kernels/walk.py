@@ -5,8 +5,6 @@ states at its ends differ and none else; where they do not, the cells of the lea
 or a retained part is near, the stretch is clipped down the tree.
 """
 
-import math
-
 import numpy as np
 
 from hhsr.kernels.cell import leaf_implicit
@@ -20,9 +18,9 @@ from hhsr.kernels.lane import (
     GAP,
     INVERSE,
     LAST,
-    LEAP_TABLE,
     LEFT_AT,
     NUDGED,
+    OCTANT,
     RUNS_USED,
     SHIFT,
     SIGN,
@@ -30,7 +28,6 @@ from hhsr.kernels.lane import (
     SPEED,
     START,
     STATE,
-    STEP_TABLE,
     STOP,
     SURE,
     SURFEL,
@@ -40,23 +37,25 @@ from hhsr.kernels.lane import (
 )
 from hhsr.kernels.layout import NODE_FLOAT_SIZE, NODE_FLOATS, OWNER_INT_SIZE, OWNER_INTS, OWNER_RECORD, VOXELS
 from hhsr.kernels.runs import MONOTONE, NONE, OWN, OWNER, RUN_BEGIN, close, enter, note
-from hhsr.kernels.surfel import BEND, DETAIL_SIZE, EXTRA, OFFSET, PLANE_SIZE, SURFEL_OWNER, THICK, TURN
+from hhsr.kernels.surfel import BEND, DETAIL_SIZE, EXTRA, PLANE_SIZE, SURFEL_OWNER, THICK, TURN
 from hhsr.kernels.tree import into_leaf
 from hhsr.kernels.unmanaged import inlined, unmanaged
 from hhsr.kernels.voxels import (
-    BASES,
     BRICK,
-    BRICK_PLANES,
+    BRICK_SIZE,
+    BRICK_SURFEL,
+    BRICK_VOXELS,
     BRICKS,
-    BYTES,
     DETAILS,
-    FARTHEST_STEP,
     NO_SURFEL,
-    OUT_BYTE,
     PLANES,
-    STEP_BITS,
-    STEP_WORDS,
+    VOXELS_AT,
+    leap_of,
+    level_of,
+    rise_of,
     solid_contains,
+    state_of,
+    step_of,
 )
 
 SPARE = 8  # records that are left when a walk alone waits for its runs to be settled
@@ -78,13 +77,12 @@ def go_on(blob, ints, tab, lanes, lane, first, alone, runs):
     alone: to the end, or until there is little room for runs. Else to a voxel that may be left by strides of all lanes
     (`hhsr.kernels.stride`). No run is pending then. first: to the first place that the state has surely changed at.
     """
-    octets, words = blob.view(np.uint8), blob.view(np.int32)
+    shorts, words = blob.view(np.int16), blob.view(np.int32)
     c = ints[VOXELS]
     nx, ny, nz = ints[c], ints[c + 1], ints[c + 2]
     top_x, top_y, top_z = BRICK * nx - 1, BRICK * ny - 1, BRICK * nz - 1
-    bricks, bases = ints[c + BRICKS], ints[c + BASES]
-    brick_planes, planes, details = ints[c + BRICK_PLANES], ints[c + PLANES], ints[c + DETAILS]
-    leaps, steps, voxels = int(lanes[LEAP_TABLE, lane]), int(lanes[STEP_TABLE, lane]), ints[c + BYTES]
+    bricks, voxels, octant = ints[c + BRICKS], ints[c + VOXELS_AT], int(lanes[OCTANT, lane])
+    planes, details = ints[c + PLANES], ints[c + DETAILS]
     px, py, pz = lanes[START, lane], lanes[START + 1, lane], lanes[START + 2, lane]
     qx, qy, qz = lanes[END, lane], lanes[END + 1, lane], lanes[END + 2, lane]
     dx, dy, dz = qx - px, qy - py, qz - pz
@@ -119,40 +117,35 @@ def go_on(blob, ints, tab, lanes, lane, first, alone, runs):
         x, y, z = ux + t * vx, uy + t * vy, uz + t * vz
         i, j, k = min(max(int(x), 0), top_x), min(max(int(y), 0), top_y), min(max(int(z), 0), top_z)
         bi, bj, bk = i >> 2, j >> 2, k >> 2
-        brick = (bi * ny + bj) * nz + bk
-        leap = np.int64(octets[leaps + brick])
+        brick = bricks + BRICK_SIZE * ((bi * ny + bj) * nz + bk)
+        held = np.int64(words[brick + BRICK_VOXELS])
         known, surfel, plain, proven, far, r = UNKNOWN, np.int64(-1), False, False, np.inf, np.int64(1)
-        if leap != 0:
-            known = 1 if leap < 128 else 0
-            r = leap if leap < 128 else 256 - leap
+        if held < 0:
+            r = leap_of(words, brick, octant)
+            known, r = (1 if r > 0 else 0), abs(r)
             ex = ((bi + sx * r + ox) << 2) * ix + kx
             ey = ((bj + sy * r + oy) << 2) * iy + ky
             ez = ((bk + sz * r + oz) << 2) * iz + kz
         else:
-            slot = np.int64(words[bricks + brick])
-            o = brick_planes + PLANE_SIZE * slot
-            gx, gy, gz = np.float64(tab[o]), np.float64(tab[o + 1]), np.float64(tab[o + 2])
-            l0 = gx * (x - ((i | 3) - 1)) + gy * (y - ((j | 3) - 1)) + gz * (z - ((k | 3) - 1)) + tab[o + OFFSET]
-            inner = ((i & 3) << 4) | ((j & 3) << 2) | (k & 3)
-            byte = np.int64(octets[voxels + 64 * slot + inner])
-            proven = byte > NO_SURFEL
+            l0 = level_of(shorts, 2 * brick, x - ((i | 3) - 1), y - ((j | 3) - 1), z - ((k | 3) - 1))
+            voxel = np.int64(shorts[voxels + held + (((i & 3) << 4) | ((j & 3) << 2) | (k & 3))])
+            proven = voxel < 0
             if proven:
-                known = 1 if byte < OUT_BYTE else 0
-                step = np.int64(words[steps + STEP_WORDS * slot + (inner >> 4)]) >> (STEP_BITS * (inner & 15))
-                r <<= step & FARTHEST_STEP
+                known = 1 if state_of(voxel) > 0 else 0
+                r += step_of(voxel, octant)
             plain = abs(l0) > 1.0
             if plain:
                 # The brick's own plane decides, up to where the segment comes near it; or the voxel goes on farther.
                 known = 1 if l0 < 0.0 else 0
-                slope = gx * vx + gy * vy + gz * vz
+                slope = rise_of(shorts, 2 * brick, vx, vy, vz)
                 if (l0 > 0.0) != (slope > 0.0) and slope != 0.0:
                     far = t + (abs(l0) - 1.0) / abs(slope)
                 ex = ((bi + sx + ox) << 2) * ix + kx
                 ey = ((bj + sy + oy) << 2) * iy + ky
                 ez = ((bk + sz + oz) << 2) * iz + kz
                 far = min(min(ex, ey), min(ez, far))
-            elif byte < NO_SURFEL:
-                surfel = np.int64(words[bases + slot]) + byte
+            elif 0 <= voxel < NO_SURFEL:
+                surfel = np.int64(words[brick + BRICK_SURFEL]) + voxel
             ex = (i + sx * r + ox) * ix + kx
             ey = (j + sy * r + oy) * iy + ky
             ez = (k + sz * r + oz) * iz + kz
@@ -168,11 +161,18 @@ def go_on(blob, ints, tab, lanes, lane, first, alone, runs):
         a, b, after, owner, cut = t, end, UNKNOWN, -1, False
         slope = stray = bend = guess = 0.0
         if surfel >= 0:
-            if math.isnan(tab[planes + PLANE_SIZE * surfel + OFFSET]):
-                # A cut passes: the side that t is on, and no farther than the cut.
-                cut = True
-                o = details + DETAIL_SIZE * surfel
-                n = ints[NODE_FLOATS] + NODE_FLOAT_SIZE * (-1 - int(tab[o + SURFEL_OWNER]))
+            o = planes + PLANE_SIZE * surfel
+            slope = rise_of(shorts, o, vx, vy, vz)
+            l0 = level_of(shorts, o, x - i - 0.5, y - j - 0.5, z - k - 0.5)
+            l1 = l0 + slope * (end - t)
+            decided = (l0 > 1.0 and l1 > 1.0) or (l0 < -1.0 and l1 < -1.0)
+            o = details + DETAIL_SIZE * surfel
+            if not decided:
+                owner = int(tab[o + SURFEL_OWNER])
+                cut = owner < 0
+            if cut:
+                # A cut passes, and the plane of both sides does not decide: the side that t is on, and no farther.
+                n = ints[NODE_FLOATS] + NODE_FLOAT_SIZE * (-1 - owner)
                 h = blob[n] * px + blob[n + 1] * py + blob[n + 2] * pz - blob[n + 3]
                 g = blob[n] * dx + blob[n + 1] * dy + blob[n + 2] * dz
                 right = h >= 0.0
@@ -182,20 +182,18 @@ def go_on(blob, ints, tab, lanes, lane, first, alone, runs):
                     if t < meet:
                         end = min(end, meet)
                 surfel = np.int64(tab[o + EXTRA]) + (1 if right else 0)
-            o = planes + PLANE_SIZE * surfel
-            gx, gy, gz = np.float64(tab[o]), np.float64(tab[o + 1]), np.float64(tab[o + 2])
-            slope = gx * vx + gy * vy + gz * vz
-            l0 = gx * (x - i - 0.5) + gy * (y - j - 0.5) + gz * (z - k - 0.5) + tab[o + OFFSET]
-            l1 = l0 + slope * (end - t)
+                o = planes + PLANE_SIZE * surfel
+                slope = rise_of(shorts, o, vx, vy, vz)
+                l0 = level_of(shorts, o, x - i - 0.5, y - j - 0.5, z - k - 0.5)
+                l1 = l0 + slope * (end - t)
+                decided = (l0 > 1.0 and l1 > 1.0) or (l0 < -1.0 and l1 < -1.0)
+                o = details + DETAIL_SIZE * surfel
+                owner = int(tab[o + SURFEL_OWNER])
             b = end
             if abs(l0) > 1.0:
                 known = 1 if l0 < 0.0 else 0
             if abs(l1) > 1.0:
                 after = 1 if l1 < 0.0 else 0
-            decided = known != UNKNOWN and known == after
-            if cut or not decided:
-                o = details + DETAIL_SIZE * surfel
-                owner = int(tab[o + SURFEL_OWNER])
             if decided:
                 surfel = np.int64(-1)
             else:
@@ -244,7 +242,7 @@ def go_on(blob, ints, tab, lanes, lane, first, alone, runs):
 def cross_voxel(ints, tab, lanes, lane, runs):
     """Take a lane through the voxel where its stride ended if its surfel settles that; return whether it did.
 
-    What `go_on` does most often: no run is pending, the plane proves the state behind the voxel and F monotone in it.
+    What `go_on` does most often: no run is pending, and the plane proves the state behind the voxel.
     """
     surfel, state = int(lanes[SURFEL, lane]), lanes[STATE, lane] > 0.0
     if surfel < 0 or lanes[STATE, lane] < 0.0:
@@ -255,17 +253,18 @@ def cross_voxel(ints, tab, lanes, lane, runs):
     if abs(l1) <= 1.0 or (sure and (l0 < 0.0) != state):
         return False
     o = ints[ints[VOXELS] + DETAILS] + DETAIL_SIZE * surfel
-    speed, thick = lanes[SPEED, lane], np.float64(tab[o + THICK])
-    stray = speed * np.float64(tab[o + TURN])
-    if abs(slope * thick) <= stray:
+    owner = int(tab[o + SURFEL_OWNER])
+    if owner < 0:
         return False
-    if (l1 < 0.0) != state:
+    speed, thick = lanes[SPEED, lane], np.float64(tab[o + THICK])
+    stray, after = speed * np.float64(tab[o + TURN]), l1 < 0.0
+    if after != state or abs(slope * thick) <= stray:
         a = t + (abs(l0) - 1.0) / abs(slope) if sure else t
         b = max(a, end - (abs(l1) - 1.0) / abs(slope))
-        bend = speed * speed * np.float64(tab[o + BEND])
-        enter(np.int64(NONE), runs, lanes, a, b, int(tab[o + SURFEL_OWNER]), slope * thick, stray, bend, t - l0 / slope)
-        close(np.int64(MONOTONE), runs, lanes, lane, state, not state, b, np.int64(surfel))
-        lanes[STATE, lane] = 0.0 if state else 1.0
+        guess, bend = t - l0 / slope if slope != 0.0 else t, speed * speed * np.float64(tab[o + BEND])
+        kind = enter(np.int64(NONE), runs, lanes, a, b, owner, slope * thick, stray, bend, guess)
+        close(kind, runs, lanes, lane, state, after, b, np.int64(surfel))
+        lanes[STATE, lane] = 1.0 if after else 0.0
     t = max(end, t) + lanes[NUDGED, lane]
     lanes[T, lane] = lanes[LEFT_AT, lane] = t
     lanes[SURE, lane], lanes[LAST, lane] = 1.0 if sure else 0.0, -1.0

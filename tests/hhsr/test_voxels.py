@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hhsr.kernels import layout as at
 from hhsr.kernels import voxels as grid_at
 from hhsr.kernels.stretch import excess, excess_along
-from hhsr.kernels.surfel import BEND, DETAIL_SIZE, EXTRA, OFFSET, PLANE_SIZE, SURFEL_OWNER, THICK, TURN
+from hhsr.kernels.surfel import BEND, DETAIL_SIZE, EXTRA, FINE, OFFSET, PLANE_SIZE, SURFEL_OWNER, THICK, TURN
 from hhsr.kernels.tree import into_leaf, turn_into_leaf
 from hhsr.model import FloatArray, rotation_matrix
 from hhsr.segments import cross_segments
@@ -34,8 +34,11 @@ class Grid:
         self.low, self.side = self.blob[frame : frame + 3], float(self.blob[frame + 3])
         self.bricks = self.record[:3]
         count = int(self.bricks.prod())
-        self.slots = self.words[int(self.record[grid_at.BRICKS]) :][:count].reshape(self.bricks)
-        self.octets = self.blob.view(np.uint8)[int(self.record[grid_at.BYTES]) :]
+        table = self.words[int(self.record[grid_at.BRICKS]) :][: count * grid_at.BRICK_SIZE]
+        self.table = table.reshape(*self.bricks, grid_at.BRICK_SIZE)
+        self.slots = self.table[..., grid_at.BRICK_VOXELS] // 64  # −1: proven
+        self.shorts = self.blob.view(np.int16)
+        self.voxels = self.shorts[int(self.record[grid_at.VOXELS_AT]) :][: 64 * (self.slots.max() + 1)]
         self.tables = self.blob[int(self.ints[at.MAP_START]) :].view(np.float32)
 
     def surfels(self) -> list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]:
@@ -46,10 +49,10 @@ class Grid:
         found = []
         for brick in np.argwhere(self.slots >= 0):
             slot = int(self.slots[tuple(brick)])
-            for place, byte in enumerate(self.octets[64 * slot : 64 * slot + 64]):
-                if byte >= grid_at.NO_SURFEL:
+            for place, voxel in enumerate(self.voxels[64 * slot : 64 * slot + 64]):
+                if not 0 <= voxel < grid_at.NO_SURFEL:
                     continue
-                number = int(self.words[int(self.record[grid_at.BASES]) + slot]) + int(byte)
+                number = int(self.table[(*brick, grid_at.BRICK_SURFEL)]) + int(voxel)
                 centre = self.low + self.side * (4 * brick + [place >> 4, (place >> 2) & 3, place & 3] + 0.5)
                 _, details = self.parts(number)
                 if details[SURFEL_OWNER] >= 0:
@@ -65,7 +68,7 @@ class Grid:
         """Return the plane (4,) and the details (4,) of a surfel."""
         plane = int(self.record[grid_at.PLANES]) + PLANE_SIZE * number
         details = int(self.record[grid_at.DETAILS]) + DETAIL_SIZE * number
-        return self.tables[plane : plane + PLANE_SIZE], self.tables[details : details + DETAIL_SIZE]
+        return self.shorts[plane : plane + PLANE_SIZE] / FINE, self.tables[details : details + DETAIL_SIZE]
 
     def leaf(self, owner: int) -> int:
         """Return the record of a model leaf."""
@@ -117,25 +120,24 @@ def test_a_plane_holds_all_over_its_voxel(depth: int, seed: int) -> None:
 def test_nothing_changes_in_the_cube_of_a_leap(depth: int, seed: int) -> None:
     grid = Grid(Shape(random_tree(seed, depth)))
     mixed = np.argwhere(grid.slots >= 0)
-    first = grid.octets[: 64 * len(mixed)].astype(int).reshape(-1, 4, 4, 4)
-    states = np.where(first < grid_at.IN_BYTE, 0, np.where(first < grid_at.OUT_BYTE, 1, -1))
-    packed, stride = grid.words[int(grid.record[grid_at.STEPS]) :], int(grid.record[grid_at.OCTANT_WORDS])
-    assert stride == grid_at.STEP_WORDS * len(mixed)
-    whole = np.where(grid.slots == grid_at.INSIDE_BRICK, 1, -1).repeat(4, 0).repeat(4, 1).repeat(4, 2)
+    voxels = grid.voxels.astype(int).reshape(-1, 4, 4, 4)
+    states = np.where(voxels >= 0, 0, np.where(voxels & grid_at.IN_BIT, 1, -1))
+    leaps = grid.table.view(np.int8)[..., :8]
+    whole = np.where(leaps[..., 0] > 0, 1, -1).repeat(4, 0).repeat(4, 1).repeat(4, 2)
     for brick in mixed:
         i, j, k = 4 * brick
         whole[i : i + 4, j : j + 4, k : k + 4] = states[grid.slots[tuple(brick)]]
     longest = 0
     for octant in range(8):
-        words = packed[octant * stride :][:stride].reshape(-1, grid_at.STEP_WORDS, 1)
-        steps = (words >> (grid_at.STEP_BITS * np.arange(16)) & grid_at.FARTHEST_STEP).reshape(-1, 4, 4, 4)
+        bits = grid_at.SHORT_BITS + grid_at.STEP_BITS * (voxels >> octant & 1)
+        steps = voxels >> bits & grid_at.FARTHEST_STEP
         ways = [1 if octant >> axis & 1 else -1 for axis in range(3)]
         for brick in mixed[:: max(1, len(mixed) // 60)]:
             for place in np.ndindex(4, 4, 4):
                 state = states[(grid.slots[tuple(brick)], *place)]
                 if state == 0:
                     continue
-                leap = 1 << steps[(grid.slots[tuple(brick)], *place)]
+                leap = 1 + steps[(grid.slots[tuple(brick)], *place)]
                 at_voxel = 4 * brick + place
                 cube = whole[
                     tuple(
@@ -166,6 +168,40 @@ def test_points_on_borders_of_voxels(depth: int, bands: bool, parts: bool) -> No
     assert np.array_equal(shape.contains(points), shape.field(points) <= 0)
 
 
+@pytest.mark.parametrize("seed", [2, 3, 5])
+def test_one_plane_decides_for_both_sides_of_a_cut(seed: int) -> None:
+    """Of voxels that a cut passes and of whole bricks: wherever it decides, close to the cut too."""
+    shape = Shape(random_tree(seed, 2))
+    grid, rng = Grid(shape), np.random.default_rng(seed)
+    rotation, shift = rotation_matrix(shape.tree.pose[:3]), shape.tree.pose[3:]
+    decided = 0
+    for brick in np.argwhere(grid.slots >= 0):
+        numbers = grid.voxels[64 * grid.slots[tuple(brick)] :][:64]
+        planes = [(grid.low + grid.side * 4 * (brick + 0.5), 2.0, 2 * _first_word(grid, brick), None)]
+        for place in np.flatnonzero((numbers >= 0) & (numbers < grid_at.NO_SURFEL)):
+            number = int(grid.table[(*brick, grid_at.BRICK_SURFEL)]) + int(numbers[place])
+            owner = int(grid.parts(number)[1][SURFEL_OWNER])
+            if owner < 0:
+                middle = grid.low + grid.side * (4 * brick + [place >> 4, (place >> 2) & 3, place & 3] + 0.5)
+                planes.append((middle, 0.5, int(grid.record[grid_at.PLANES]) + PLANE_SIZE * number, owner))
+        for middle, half, start, owner in planes:
+            u = rng.uniform(-half, half, (20, 3))
+            if owner is not None:  # half of them on the cut
+                node = int(grid.ints[at.NODE_FLOATS]) + at.NODE_FLOAT_SIZE * (-1 - owner)
+                n, c = grid.blob[node : node + 3], grid.blob[node + 3]
+                u[:10] -= np.outer((u[:10] @ n) + (n @ middle - c) / grid.side, n)
+            level = (grid.shorts[start : start + 3] @ u.T + grid.shorts[start + 3]) / FINE
+            sure = (np.abs(level) > 1.0) & (np.abs(u) <= half).all(axis=1)
+            points = (middle + grid.side * u[sure]) @ rotation.T + shift
+            assert np.array_equal(shape.field(points) <= 0, level[sure] < 0)
+            decided += int(sure.sum()) if owner is not None else 0
+    assert decided > 200
+
+
+def _first_word(grid: Grid, brick: np.ndarray) -> int:
+    return int(grid.record[grid_at.BRICKS]) + grid_at.BRICK_SIZE * int(np.ravel_multi_index(tuple(brick), grid.bricks))
+
+
 def without_grid(blob: np.ndarray) -> np.ndarray:
     """Return the blob as it was before it had a grid, read-only."""
     copy = blob.copy()
@@ -179,7 +215,7 @@ def follow(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (counts, whether segments begin inside, t)."""
     counts, places, begins = (np.empty(len(starts), dtype=kind) for kind in (np.int64, np.int64, np.bool_))
-    t = cross_segments(blob, starts, ends, first, 0.01, 0.001, counts, begins, places)
+    t = cross_segments(blob, starts, ends, np.arange(len(starts)), first, 0.01, 0.001, counts, begins, places)
     assert len(t) == np.maximum(counts, 0).sum()
     found = [t[place : place + count] for place, count in zip(places, counts, strict=True) if count > 0]
     return counts, begins, np.concatenate([*found, np.empty(0)])

@@ -118,6 +118,7 @@ def _nested() -> Node:
 TREES: dict[str, Callable[[], Tree]] = {
     "ball": lambda: Tree(ball(10.0), frozen(POSE)),
     "lumpy": lambda: Tree(lumpy(1), frozen(POSE)),
+    "smooth": lambda: Tree(lumpy(3, knots=False), frozen(np.zeros(6))),
     "pitted": lambda: Tree(pitted(), frozen(np.zeros(6))),
     "halves": lambda: Tree(step(X, 0.0, ball(10.0), ball(6.0)), frozen(np.zeros(6))),
     "corner": lambda: Tree(step(X, 0.0, nothing(), step(Y, 0.0, nothing(), cube())), frozen(np.zeros(6))),

@@ -10,10 +10,18 @@ from numba import config
 
 from hhsr.kernels.along import ALONG_ROWS
 from hhsr.kernels.crossing import scratch
-from hhsr.kernels.lane import BEGIN, FIRST_RUN, ROWS, RUNS_USED, set_out
+from hhsr.kernels.lane import BEGIN, FIRST_RUN, MERGE, ROWS, RUNS_USED, set_out
 from hhsr.kernels.layout import integers, tables
-from hhsr.kernels.run_batch import ROOM, gather_crossings, most_keys, order_runs, settle_others, settle_smooth
-from hhsr.kernels.runs import RUN_SIZE
+from hhsr.kernels.run_batch import (
+    ROOM,
+    gather_crossings,
+    most_keys,
+    most_runs,
+    order_runs,
+    settle_others,
+    settle_smooth,
+)
+from hhsr.kernels.runs import ANSWER_SIZE, RUN_SIZE
 from hhsr.kernels.segment import PIECES
 from hhsr.kernels.tree import into_tree
 from hhsr.kernels.vectors import LANES
@@ -33,7 +41,7 @@ def test_many_segments_have_the_crossings_of_each(name: str) -> None:
     work, slots, pending = scratch()
     lanes, runs = work[PIECES : PIECES + ROWS], np.zeros((60 * COUNT, RUN_SIZE))
     starts, ends = around(name, 6, COUNT), around(name, 7, COUNT)
-    counts, places = np.zeros(COUNT, dtype=np.int64), np.full(COUNT, -1)
+    places = np.full(COUNT, -1)
     inside = np.zeros(COUNT, dtype=bool)
     for i in range(COUNT):
         p, q = into_tree(blob, ints, *starts[i]), into_tree(blob, ints, *ends[i])
@@ -41,15 +49,22 @@ def test_many_segments_have_the_crossings_of_each(name: str) -> None:
             assert go_on(blob, ints, tab, lanes, 0, False, True, runs)
             places[i], inside[i] = int(lanes[FIRST_RUN, 0]), lanes[BEGIN, 0] > 0.0
     used = int(lanes[RUNS_USED, 0])
-    order, bins = np.empty(used, dtype=np.int32), np.empty(most_keys(ints), dtype=np.int32)
-    smooth = int(order_runs(blob, ints, runs, used, bins, order))
-    assert sorted(order.tolist()) == list(range(used))
-    found, ts = np.empty(ROOM * (used + 1)), np.empty(ROOM * (used + 1))
-    settle_smooth(blob, ints, runs, order, smooth, 0.001, found, np.empty((ALONG_ROWS, LANES)))
-    begun = np.array([smooth, smooth])
-    assert settle_others(blob, ints, tab, runs, order, used, begun, 0.01, 0.001, found, work, slots, pending)
-    assert gather_crossings(runs, found, False, 0, COUNT, counts, places, ts, 0) == counts.sum()
+    most = int(most_runs(runs, used))
+    assert used <= most <= len(runs)
+    order, later = np.empty(2 * most, dtype=np.int32), np.empty((2, most), dtype=np.int32)
+    bins, answers = np.empty(most_keys(ints), dtype=np.int32), np.empty((most, ANSWER_SIZE), dtype=np.int32)
+    smooth = int(order_runs(blob, ints, runs, used, bins, order, answers))
+    assert sorted(order[:used].tolist()) == list(range(used))
+    found, ts = np.empty(ROOM * (most + 1)), np.empty(ROOM * (most + 1))
+    rows = np.empty((ALONG_ROWS, LANES))
+    end, settled = settle_smooth(blob, ints, tab, runs, used, order, smooth, later, 0.001, found, rows, answers)
+    begun = np.array([smooth, settled])
+    assert settle_others(blob, ints, tab, runs, order, end, begun, 0.01, 0.001, found, work, slots, pending, answers)
     for i in range(COUNT):
         alone = shape.crossings(starts[i], ends[i])
-        assert np.allclose(ts[places[i] : places[i] + counts[i]], alone.t, rtol=0, atol=1e-12)
+        count, last = gather_crossings(
+            answers, found, False, places[i], 0, MERGE / math.dist(starts[i], ends[i]), ts, 0
+        )
+        assert count == last == len(alone.t)
+        assert np.allclose(ts[:count], alone.t, rtol=0, atol=1e-12)
         assert inside[i] == shape.contains(starts[i])
