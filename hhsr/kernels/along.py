@@ -7,7 +7,6 @@ exponential is that of `hhsr.kernels.sphere_rbf`.
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -112,7 +111,7 @@ def emit_fields(
 
     nothing = Vector.of(builder, ir.Constant(DOUBLE, 0.0)).value
     totals = [Vector(builder, total) for total in _summed(builder, terms, SUMS, [nothing] * (2 * SUMS), add)]
-    return [_total(totals[:SUMS], operator.add), _total(totals[SUMS:], operator.add)]
+    return [_total(some, lambda one, other: one + other) for some in (totals[:SUMS], totals[SUMS:])]
 
 
 def _total(sums: list[Any], plus: Callable[[Any, Any], Any]) -> Any:
