@@ -23,7 +23,7 @@ from hhsr.kernels.seeds import fill_seeds
 from hhsr.kernels.slab_bounds import fill_lobe_spheres
 from hhsr.model import Cut, FloatArray, ModelLeaf, RetainedPart, rotation_matrix
 
-VOXELS_TOTAL = 560_000  # some 6 bytes each, surfels and all
+VOXELS_TOTAL = 560_000  # some 3 bytes each, surfels and all
 SEEDS_TOTAL = 60_000  # four bytes each
 EMPTY = 1e9  # mm: where a block has no disc
 

@@ -19,11 +19,10 @@ from hhsr.kernels.vectors import LANES, ask_ahead
 
 # Kinds of runs: none; F is proven monotone; one leaf's; anybody's; no stretch, but a change at one place.
 NONE, MONOTONE, OWN, CLIPPED, POINT = 0, 1, 2, 3, 4
-# A record: kind + 8·(state before) + 16·(state after) + 32·(F rises), −1 where its crossings were too many; t where it
-# begins and ends; t where F is about 1; the least and greatest |dF/dt|; |d²F/dt²|; MERGE as a share of the segment
-# (while it is pending, the sign of dF/dt); its owner + OWNERS·key; the segment's start and end (tree's frame, mm), or,
-# of one leaf's run that is ready, its start and vector in the leaf's frame; the number of the segment's next record, −1
-# of its last.
+# A record: kind + 8·(state before) + 16·(state after) + 32·(F rises); t where it begins and ends; t where F is about 1;
+# the least and greatest |dF/dt|; |d²F/dt²|; MERGE as a share of the segment (while it is pending, the sign of dF/dt);
+# its owner + OWNERS·key; the segment's start and end (tree's frame, mm), or, of one leaf's run that is ready, its start
+# and vector in the leaf's frame; the number of the segment's next record, −1 of its last.
 CODE, RUN_BEGIN, RUN_END, GUESS, LEAST, MOST, RUN_BEND, RUN_GAP, OWNER = 0, 1, 2, 3, 4, 5, 6, 7, 8
 RUN_FROM, RUN_TO, NEXT, RUN_SIZE = 9, 12, 15, 16
 BEFORE, AFTER, RISES = 8, 16, 32  # in the code

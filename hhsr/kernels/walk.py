@@ -71,6 +71,14 @@ def _holds(blob, ints, owner, x, y, z):
 
 
 @inlined
+def _along_plane(shorts, plane, x, y, z, vx, vy, vz, length):
+    """Return (slope, value at a place, value `length` of t on, whether the plane decides all between the two)."""
+    slope, l0 = rise_of(shorts, plane, vx, vy, vz), level_of(shorts, plane, x, y, z)
+    l1 = l0 + slope * length
+    return slope, l0, l1, (l0 > 1.0 and l1 > 1.0) or (l0 < -1.0 and l1 < -1.0)
+
+
+@inlined
 def go_on(blob, ints, tab, lanes, lane, first, alone, runs):
     """Go on with the walk in a lane, keeping its runs (n, RUN_SIZE); return whether it is at its end.
 
@@ -161,11 +169,9 @@ def go_on(blob, ints, tab, lanes, lane, first, alone, runs):
         a, b, after, owner, cut = t, end, UNKNOWN, -1, False
         slope = stray = bend = guess = 0.0
         if surfel >= 0:
-            o = planes + PLANE_SIZE * surfel
-            slope = rise_of(shorts, o, vx, vy, vz)
-            l0 = level_of(shorts, o, x - i - 0.5, y - j - 0.5, z - k - 0.5)
-            l1 = l0 + slope * (end - t)
-            decided = (l0 > 1.0 and l1 > 1.0) or (l0 < -1.0 and l1 < -1.0)
+            slope, l0, l1, decided = _along_plane(
+                shorts, planes + PLANE_SIZE * surfel, x - i - 0.5, y - j - 0.5, z - k - 0.5, vx, vy, vz, end - t
+            )
             o = details + DETAIL_SIZE * surfel
             if not decided:
                 owner = int(tab[o + SURFEL_OWNER])
@@ -182,11 +188,9 @@ def go_on(blob, ints, tab, lanes, lane, first, alone, runs):
                     if t < meet:
                         end = min(end, meet)
                 surfel = np.int64(tab[o + EXTRA]) + (1 if right else 0)
-                o = planes + PLANE_SIZE * surfel
-                slope = rise_of(shorts, o, vx, vy, vz)
-                l0 = level_of(shorts, o, x - i - 0.5, y - j - 0.5, z - k - 0.5)
-                l1 = l0 + slope * (end - t)
-                decided = (l0 > 1.0 and l1 > 1.0) or (l0 < -1.0 and l1 < -1.0)
+                slope, l0, l1, decided = _along_plane(
+                    shorts, planes + PLANE_SIZE * surfel, x - i - 0.5, y - j - 0.5, z - k - 0.5, vx, vy, vz, end - t
+                )
                 o = details + DETAIL_SIZE * surfel
                 owner = int(tab[o + SURFEL_OWNER])
             b = end
