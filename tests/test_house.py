@@ -28,7 +28,9 @@ EMITTERS = {
     "vectors.py",
     "stride.py",
     "along.py",
-}  # these write the processor's vectors themselves (decisions 0007 to 0009)
+    "cell_along.py",
+    "either_lanes.py",
+}  # these write the processor's vectors themselves (decisions 0007 to 0010)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "hhsr" / "kernels").glob("*.py")), ids=lambda p: p.name)

@@ -1,13 +1,13 @@
-"""A leaf's F − 1 and its change along a line: at one point, or at eight of one block side by side, to the same bits.
+"""A leaf's F − 1 at a point, and its change along a line.
 
-The scale field is Σ w λ(h) over a block's centres, in one order, with the same roundings in both. λ's
-exponential is that of `hhsr.kernels.sphere_rbf`.
+The scale field is Σ w λ(h) over a block's centres, LANES at a time. λ's exponential is that of
+`hhsr.kernels.sphere_rbf`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,21 +18,18 @@ from numba.extending import intrinsic
 from hhsr.kernels.cell import axis_scale
 from hhsr.kernels.sphere_rbf import POWERS, gaussian_jet
 from hhsr.kernels.unmanaged import inlined, unmanaged
-from hhsr.kernels.vectors import DOUBLE, INT, LANES, LONG, Vector, fused, load, root, store
+from hhsr.kernels.vectors import DOUBLE, INT, LANES, LONG, Vector, fused, load
 
-# Rows of LANES numbers each, of points side by side: places (leaf's frame), ways, and then F − 1 and its change.
-PLACE, WAY, EXCESS, RISE, ALONG_ROWS = 0, 3, 6, 7, 8
-SUMS = 4  # the k-th centre's terms go to sum k mod SUMS: no addition waits long for the one before
 # The fourth power of their polynomial in 2h − 1 is λ's exponential: that at h = 1/2 is in them.
 _P0, _P1, _P2, _P3, _P4, _P5, _P6, _P7, _P8, _P9, _P10, _P11 = (power * math.exp(-0.5) for power in POWERS)
 
 
-def _terms(builder: Any, unit: Any, way: Any, centre: Sequence[Vector]) -> tuple[Vector, Vector, Vector, Vector]:
-    """Return (e, rest, f, g) of centres (x, y, z, 1/(1 − cos σ), weight): e·rest adds to s, f·g to its change."""
+def _terms(builder: Any, unit: Sequence[Vector], centre: Sequence[Vector]) -> tuple[Vector, Vector]:
+    """Return (w e^(−4h) (1 − h), 1 − h) of centres (x, y, z, 1/(1 − cos σ), weight)."""
     cx, cy, cz, inverse, weight = centre
     tau = fused(unit[2], cz, fused(unit[1], cy, unit[0] * cx))
     one = Vector.of(builder, ir.Constant(DOUBLE, 1.0))
-    rest = fused(tau, inverse, one - inverse).most(0.0)  # 1 − h
+    rest = fused(tau, inverse, one - inverse).most(0.0)
     t = fused(rest, -2.0, 1.0)
     t2 = t * t
     t4 = t2 * t2
@@ -40,108 +37,46 @@ def _terms(builder: Any, unit: Any, way: Any, centre: Sequence[Vector]) -> tuple
     low = fused(fused(fused(t, _P7, _P6), t2, fused(t, _P5, _P4)), t4, low)
     fourth = fused(fused(fused(t, _P11, _P10), t2, fused(t, _P9, _P8)), t4 * t4, low)
     half = fourth * fourth
-    e = weight * (half * half) * rest
-    return e, rest, e * inverse * fused(rest, 4.0, 2.0), fused(way[2], cz, fused(way[1], cy, way[0] * cx))
+    return weight * (half * half) * rest, rest
 
 
-def _summed(
-    builder: Any, count: Any, step: int, nothing: list[Any], add: Callable[[Any, list[Any]], list[Any]]
-) -> list[Any]:
-    """Emit a loop over 0, step, … < count; return sums, from `nothing` on, as add(number, sums) grows them."""
+def emit_field(builder: Any, blob: Any, first: Any, count: Any, unit: Sequence[Any], way: Sequence[Any]) -> list[Any]:
+    """Emit s of a direction, and ds along a way, where that has three parts, not none; LANES centres at a time."""
+    unit, way = ([Vector.of(builder, number) for number in numbers] for numbers in (unit, way))
     before, body, after = builder.block, *(builder.append_basic_block(name) for name in ("centres", "summed"))
-    zero = ir.Constant(LONG, 0)
+    zero, nothing = ir.Constant(LONG, 0), Vector.of(builder, ir.Constant(DOUBLE, 0.0)).value
     builder.cbranch(builder.icmp_signed(">", count, zero), body, after)
     builder.position_at_end(body)
-    number, sums = builder.phi(LONG), [builder.phi(begin.type) for begin in nothing]
-    grown = add(number, sums)
-    following = builder.add(number, ir.Constant(LONG, step))
-    for phi, start, value in zip([number, *sums], [zero, *nothing], [following, *grown], strict=True):
+    number, s, ds = builder.phi(LONG), builder.phi(nothing.type), builder.phi(nothing.type)
+    places = [builder.add(first, number)]
+    for _ in range(4):
+        places.append(builder.add(places[-1], count))
+    centre = [load(builder, builder.gep(blob, [place]), 0) for place in places]
+    e, rest = _terms(builder, unit, centre)
+    grown = [fused(e, rest, Vector(builder, s)).value, ds]
+    if way:
+        along = fused(way[2], centre[2], fused(way[1], centre[1], way[0] * centre[0]))
+        grown[1] = fused(e * centre[3] * fused(rest, 4.0, 2.0), along, Vector(builder, ds)).value
+    following = builder.add(number, ir.Constant(LONG, LANES))
+    for phi, start, value in zip([number, s, ds], [zero, nothing, nothing], [following, *grown], strict=True):
         phi.add_incoming(start, before)
         phi.add_incoming(value, body)
     builder.cbranch(builder.icmp_signed("<", following, count), body, after)
     builder.position_at_end(after)
-    totals = [builder.phi(begin.type) for begin in nothing]
-    for total, begin, value in zip(totals, nothing, grown, strict=True):
-        total.add_incoming(begin, before)
+    sums = [builder.phi(nothing.type) for _ in grown]
+    for total, value in zip(sums, grown, strict=True):
+        total.add_incoming(nothing, before)
         total.add_incoming(value, body)
-    return totals
+    return [_total(builder, Vector(builder, total)) for total in (sums if way else sums[:1])]
 
 
-def _columns(builder: Any, blob: Any, first: Any, count: Any, number: Any) -> list[Any]:
-    """Return where the five numbers of a block's centre lie."""
-    places = [builder.add(first, number)]
-    for _ in range(4):
-        places.append(builder.add(places[-1], count))
-    return [builder.gep(blob, [place]) for place in places]
-
-
-def emit_field(builder: Any, blob: Any, first: Any, count: Any, unit: Sequence[Any], way: Sequence[Any]) -> list[Any]:
-    """Emit (s, ds) of one direction, LANES centres at a time, its terms added to SUMS sums, one after the other."""
-    unit, way = ([Vector.of(builder, number) for number in numbers] for numbers in (unit, way))
-
-    def add(number: Any, sums: list[Any]) -> list[Any]:
-        columns = _columns(builder, blob, first, count, number)
-        terms = _terms(builder, unit, way, [load(builder, column, 0) for column in columns])
-        s, ds = (Vector(builder, total) for total in sums)
-        for k in range(0, LANES, SUMS):
-            e, rest, f, g = (term.some(k, SUMS) for term in terms)
-            s, ds = fused(e, rest, s), fused(f, g, ds)
-        return [s.value, ds.value]
-
-    nothing = Vector.of(builder, ir.Constant(DOUBLE, 0.0), SUMS).value
-    return [
-        _total([builder.extract_element(total, ir.Constant(INT, k)) for k in range(SUMS)], builder.fadd)
-        for total in _summed(builder, count, LANES, [nothing, nothing], add)
-    ]
-
-
-def emit_fields(
-    builder: Any, blob: Any, first: Any, count: Any, terms: Any, unit: Sequence[Vector], way: Sequence[Vector]
-) -> list[Vector]:
-    """Emit (s, ds) of LANES directions at once, by the first `terms` of the centres and less than SUMS more."""
-
-    def add(number: Any, sums: list[Any]) -> list[Any]:
-        grown = [Vector(builder, total) for total in sums]
-        for k in range(SUMS):
-            columns = _columns(builder, blob, first, count, builder.add(number, ir.Constant(LONG, k)))
-            centre = [Vector.of(builder, builder.load(column)) for column in columns]
-            e, rest, f, g = _terms(builder, unit, way, centre)
-            grown[k], grown[SUMS + k] = fused(e, rest, grown[k]), fused(f, g, grown[SUMS + k])
-        return [total.value for total in grown]
-
-    nothing = Vector.of(builder, ir.Constant(DOUBLE, 0.0)).value
-    totals = [Vector(builder, total) for total in _summed(builder, terms, SUMS, [nothing] * (2 * SUMS), add)]
-    return [_total(some, lambda one, other: one + other) for some in (totals[:SUMS], totals[SUMS:])]
-
-
-def _total(sums: list[Any], plus: Callable[[Any, Any], Any]) -> Any:
-    return plus(plus(sums[0], sums[1]), plus(sums[2], sums[3]))
-
-
-def emit_excess(builder: Any, rows: Any, blob: Any, half_axes: Any, first: Any, count: Any, terms: Any) -> None:
-    """Emit F − 1 and its change of LANES points at once, from rows into rows: `ray_along`, `excess_of`, in vectors."""
-    numbers = [load(builder, rows, (PLACE + k) * LANES) for k in range(6)]
-    (x, y, z), (dx, dy, dz) = numbers[:3], numbers[3:]
-    one = Vector.of(builder, ir.Constant(DOUBLE, 1.0))
-    inverse = one / root(x * x + y * y + z * z)
-    unit = [x * inverse, y * inverse, z * inverse]
-    radial = dx * unit[0] + dy * unit[1] + dz * unit[2]
-    tangent = [(d - radial * u) * inverse for d, u in zip((dx, dy, dz), unit, strict=True)]
-    s, ds = emit_fields(builder, blob, first, count, terms, unit, tangent)
-    scaled = []
-    for axis, place in enumerate((x, y, z)):
-        sides = []
-        for side in range(2):
-            at = builder.add(half_axes, ir.Constant(LONG, 2 * axis + side))
-            size = Vector.of(builder, builder.load(builder.gep(blob, [at])))
-            sides.append(one / (size * size))
-        scaled.append((place > 0.0).where(sides[0], sides[1]) * place)
-    norm = root(scaled[0] * x + scaled[1] * y + scaled[2] * z)
-    d = one / (one - s)
-    f = norm * d
-    store(builder, f - 1.0, rows, EXCESS * LANES)
-    rise = (scaled[0] * dx + scaled[1] * dy + scaled[2] * dz) / norm + f * ds
-    store(builder, rise * d, rows, RISE * LANES)
+def _total(builder: Any, numbers: Vector) -> Any:
+    """Return the sum of all lanes."""
+    while numbers.lanes > 2:
+        half = numbers.lanes // 2
+        numbers = numbers.some(0, half) + numbers.some(half, half)
+    one, other = (builder.extract_element(numbers.value, ir.Constant(INT, k)) for k in range(2))
+    return builder.fadd(one, other)
 
 
 @intrinsic
@@ -157,6 +92,16 @@ def _field_along(typing: Any, blob: Any, first: Any, count: Any, unit: Any, way:
         )
 
     return signature, emit
+
+
+@intrinsic
+def _field_at(typing: Any, blob: Any, first: Any, count: Any, unit: Any) -> Any:
+    def emit(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        blob = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        unit = [builder.extract_value(arguments[3], k) for k in range(3)]
+        return emit_field(builder, blob, arguments[1], arguments[2], unit, ())[0]
+
+    return types.float64(blob, first, count, types.UniTuple(types.float64, 3)), emit
 
 
 @inlined
@@ -186,12 +131,9 @@ if config.DISABLE_JIT:  # type: ignore[attr-defined]
         s, fx, fy, fz = gaussian_jet(*columns, *unit)
         return s, fx * way[0] + fy * way[1] + fz * way[2]
 
-    def excess_together(rows: Any, blob: Any, half_axes: int, first: int, count: int, terms: int) -> None:
-        """Fill rows EXCESS and RISE: as compiled, but for the last bits."""
-        for lane in range(LANES):
-            (x, y, z), (dx, dy, dz) = rows[PLACE : PLACE + 3, lane], rows[WAY : WAY + 3, lane]
-            s, ds = field_along(blob, first, count, *ray_along(x, y, z, dx, dy, dz))
-            rows[EXCESS, lane], rows[RISE, lane] = excess_of(blob, half_axes, x, y, z, dx, dy, dz, s, ds)
+    def field_at(blob: Any, first: int, count: int, unit: Any) -> float:
+        """Return s: as compiled, but for the last bits."""
+        return field_along(blob, first, count, unit, unit)[0]
 
 else:
 
@@ -203,21 +145,7 @@ else:
         """
         return _field_along(blob, np.int64(first), np.int64(count), unit, way)
 
-    @intrinsic
-    def excess_together(typing: Any, rows: Any, blob: Any, half_axes: Any, first: Any, count: Any, terms: Any) -> Any:
-        """Fill rows EXCESS and RISE of points side by side (ALONG_ROWS, LANES), whose directions lie in one block.
-
-        half_axes: their float slot. first: that of the block's centres, count: how many; terms: how many from the first
-        on, for those behind have no weight.
-        """
-        signature = types.void(rows, blob, half_axes, first, count, terms)
-
-        def emit(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
-            rows, blob = (
-                context.make_array(kind)(context, builder, value).data
-                for kind, value in zip(signature.args[:2], arguments[:2], strict=True)
-            )
-            emit_excess(builder, rows, blob, *arguments[2:])
-            return context.get_dummy_value()
-
-        return signature, emit
+    @unmanaged
+    def field_at(blob, first, count, unit):
+        """Return s alone."""
+        return _field_at(blob, np.int64(first), np.int64(count), unit)

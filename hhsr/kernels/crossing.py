@@ -8,12 +8,13 @@ import math
 import numpy as np
 from numba import njit
 
+from hhsr.kernels.cell_along import CELL_ROWS
 from hhsr.kernels.clipped import follow_tree, merge_touches
 from hhsr.kernels.lane import BEGIN, FIRST_RUN, GAP, LAST_RUN, MERGE, ROWS, RUNS_USED, SPILLED, set_out
 from hhsr.kernels.layout import VOXELS, integers, tables
-from hhsr.kernels.runs import HALVINGS, RUN_SIZE, make_ready
+from hhsr.kernels.runs import HALVINGS, RUN_SIZE
 from hhsr.kernels.segment import PIECES, emit
-from hhsr.kernels.settle_run import settle_run
+from hhsr.kernels.settle_run import ask_cells, settle_run
 from hhsr.kernels.tree import into_tree
 from hhsr.kernels.unmanaged import unmanaged
 from hhsr.kernels.vectors import LANES
@@ -22,16 +23,17 @@ from hhsr.kernels.walk import go_on
 
 SLOTS = 64  # pending tree nodes of one segment: three a level
 RUNS = 64  # of one segment, before they are settled
+LANE_ROWS = PIECES + ROWS
 
 
 @njit(cache=True, error_model="numpy")
 def scratch():
     """Return (work, slots, pending): what one thread needs to follow segments.
 
-    Rows of work: PIECES for bisections, ROWS for lanes, the rest for the runs of a segment that walks alone.
+    Rows of work: PIECES for bisections, ROWS for lanes, CELL_ROWS twice, the rest for the runs of a segment alone.
     """
-    work = np.empty((PIECES + ROWS + (RUNS + HALVINGS) * RUN_SIZE // LANES, LANES))
-    work[PIECES : PIECES + ROWS] = 0.0
+    work = np.empty((LANE_ROWS + 2 * CELL_ROWS + (RUNS + HALVINGS) * RUN_SIZE // LANES, LANES))
+    work[PIECES:LANE_ROWS] = 0.0
     return work, np.empty((SLOTS, 2)), np.empty(SLOTS, dtype=np.int64)
 
 
@@ -40,7 +42,9 @@ def _walk(
     blob, ints, tab, px, py, pz, ex, ey, ez, length, resolution, tolerance, first, out, work, slots, pending
 ):  # fmt: skip
     """Return (start state, count) of a segment of some length by the walk of the voxels; count −1: too many runs."""
-    lanes, runs = work[PIECES : PIECES + ROWS], work[PIECES + ROWS :].reshape(RUNS + HALVINGS, RUN_SIZE)
+    lanes, rows = work[PIECES:LANE_ROWS], work[LANE_ROWS : LANE_ROWS + CELL_ROWS]
+    more = work[LANE_ROWS + CELL_ROWS : LANE_ROWS + 2 * CELL_ROWS]
+    runs = work[LANE_ROWS + 2 * CELL_ROWS :].reshape(RUNS + HALVINGS, RUN_SIZE)
     if not set_out(blob, ints, lanes, 0, px, py, pz, ex, ey, ez, length):
         return False, np.int64(0)
     lanes[RUNS_USED, 0] = 0.0
@@ -49,11 +53,13 @@ def _walk(
         done = go_on(blob, ints, tab, lanes, np.int64(0), first, np.bool_(True), runs[:RUNS])
         if lanes[SPILLED, 0] > 0.0:
             return False, np.int64(-1)
-        for run in range(int(lanes[RUNS_USED, 0])):
-            make_ready(blob, ints, runs, np.int64(run))
+        used = np.int64(lanes[RUNS_USED, 0])
+        for run in range(used):
+            if run % LANES == 0:
+                ask_cells(blob, ints, tab, runs, run, used, tolerance, rows)
             count = settle_run(
-                blob, ints, tab, runs, np.int64(run), np.int64(RUNS), resolution, tolerance, gap, out, count, work,
-                slots, pending,
+                blob, ints, tab, runs, run, np.int64(RUNS), resolution, tolerance, gap, out, count, work, slots,
+                pending, rows, run % LANES, more,
             )  # fmt: skip
         lanes[RUNS_USED, 0], lanes[FIRST_RUN, 0], lanes[LAST_RUN, 0] = 0.0, -1.0, -1.0
     return lanes[BEGIN, 0] > 0.0, min(count, np.int64(1)) if first else count

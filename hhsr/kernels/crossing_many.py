@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import config, njit
 
-from hhsr.kernels.along import ALONG_ROWS
+from hhsr.kernels.cell_along import CELL_ROWS
 from hhsr.kernels.crossing import scratch
 from hhsr.kernels.lane import (
     ABREAST,
@@ -50,7 +50,7 @@ from hhsr.kernels.voxels import BRICKS, DETAILS, PLANES, VOXELS_AT, solid_contai
 from hhsr.kernels.walk import SPARE, cross_voxel, go_on
 
 WAITING = 6  # so many lanes are without a stride when the others wait for them
-TOGETHER = 16_384  # segments whose runs are settled together
+TOGETHER = 3_072  # segments whose runs are settled together: so few that the second cache holds their records
 AHEAD = 8  # segments that are asked for before they are begun
 ROW, LIVE, FIRST_ROW, STOP_ROW = 0, 1, 2, 3
 ALL_LANES = 2**ABREAST - 1
@@ -134,7 +134,7 @@ def _side_by_side(blob, ints, tab, starts, ends, order, first, counts, begins, p
             i = np.int64(lanes[SEGMENT, lane])
             if i < 0:
                 continue
-            if cross_voxel(ints, tab, lanes, np.int64(lane), runs):
+            if cross_voxel(blob, ints, tab, lanes, np.int64(lane), runs):
                 if not (first and lanes[T, lane] > lanes[FOUND, lane] + lanes[GAP, lane]):
                     continue
             elif not _strode_to_end(lanes, lane) and not go_on(
@@ -187,7 +187,7 @@ def cross_many(blob, starts, ends, order, first, resolution, tolerance, counts, 
     some_begins, gaps = np.empty(some, dtype=np.bool_), np.zeros(some)
     runs = np.empty((4 * some + 8 * SPARE, RUN_SIZE))
     found, ts, begun = np.empty(2 * ROOM), np.empty(ROOM + n), np.zeros(4, dtype=np.int64)
-    rows, lanes = np.empty((ALONG_ROWS, LANES)), np.zeros((ROWS, ABREAST))
+    rows, lanes = np.empty((CELL_ROWS, LANES)), np.zeros((ROWS, ABREAST))
     bins, used, row, alone = np.empty(most_keys(ints), dtype=np.int32), 0, 0, 0
     while row < n:
         stop = min(row + TOGETHER, n)
@@ -202,13 +202,13 @@ def cross_many(blob, starts, ends, order, first, resolution, tolerance, counts, 
         while runs.shape[0] < most:
             runs = _longer(runs)
         turns, answers = np.empty(2 * most, dtype=np.int32), np.empty((most, ANSWER_SIZE), dtype=np.int32)
-        smooth = order_runs(blob, ints, runs, kept, bins, turns, answers)
-        while found.shape[0] < most:
+        smooth = order_runs(ints, runs, kept, bins, turns, answers)
+        while found.shape[0] <= most:
             found = _longer(found)
-        later = np.empty((2, most), dtype=np.int32)
+        later, given = np.empty((4, most + 1), dtype=np.int32), np.empty((most + 1, LANES))
         begun[0] = smooth
         kept, begun[1] = settle_smooth(
-            blob, ints, tab, runs, kept, turns, smooth, later, tolerance, found, rows, answers
+            blob, ints, tab, runs, kept, turns, smooth, later, given, tolerance, found, rows, answers
         )
         while not settle_others(
             blob, ints, tab, runs, turns, kept, begun, resolution, tolerance, found, work, slots, pending, answers

@@ -1,124 +1,86 @@
-"""The runs of many segments, settled in the order of the tables that they need, those of one block at once."""
-
-import math
+"""The runs of many segments, settled in the order of the voxels they lie in: neighbours read the same tables."""
 
 import numpy as np
 
-from hhsr.kernels.layout import BLOCKS_PER_SIDE, MAP_START, OWNER_COUNT, VOXELS
+from hhsr.kernels.cell_along import AGAIN, ASKED, AT, EXCESS, EXCESS_STRAY, KNOWN, ONCE, RUN, SURE, settle_by_cells
+from hhsr.kernels.layout import LANES, MAP_START, VOXELS
 from hhsr.kernels.runs import (
     ANSWER_COUNT,
     ANSWER_NEXT,
     ANSWER_PLACE,
     CODE,
+    GUESS,
     HALVINGS,
     KEY_SHIFT,
-    MONOTONE,
     NEXT,
     OWN,
-    OWNER,
     RUN_BEND,
-    ask_for_block,
-    ask_for_cells,
     ask_for_record,
+    is_smooth,
     key_of,
-    make_ready,
-    owner_of,
 )
-from hhsr.kernels.settle_run import settle_run
-from hhsr.kernels.smooth_runs import improve_together
+from hhsr.kernels.settle_run import settle_other
+from hhsr.kernels.smooth_runs import (
+    CLEAR,
+    CROSSED,
+    HALVED_IN,
+    LOST,
+    OPEN,
+    ask_formulas,
+    ask_value,
+    give,
+    halve,
+    part,
+    take_over,
+)
 from hhsr.kernels.surfel import PLANE_SIZE
 from hhsr.kernels.unmanaged import inlined, unmanaged
-from hhsr.kernels.vectors import LANES
 from hhsr.kernels.voxels import DETAILS, PLANES
 
 ROOM = 64  # crossings of one run
 # Instead of a count: a segment that is not finite; one that has no room here, of a solid without a grid, of one of
 # gigabytes, or with JIT off.
 NOT_FINITE, MANY = -1, -2
-AHEAD = 2  # runs whose cells are asked for before they are settled
-FAR_AHEAD = 16  # … whose records are
-BLOCKS_OF_A_LEAF = 6 * BLOCKS_PER_SIDE * BLOCKS_PER_SIDE
+FAR_AHEAD = 16  # runs whose records are asked for before they are settled
 
 
 @unmanaged
-def _blocks(ints):
-    """Return how many blocks of directions all owners have together: keys of runs that are ready."""
-    return ints[OWNER_COUNT] * BLOCKS_OF_A_LEAF
-
-
-@unmanaged
-def most_keys(ints):
-    """Return how many keys of runs there are: one for each block of directions, one for each 2^KEY_SHIFT surfels."""
+def _keys(ints):
+    """Return how many keys of runs there are: one for each 2^KEY_SHIFT surfels."""
     record, surfels = ints[VOXELS], np.int64(0)
     if record != 0:
         end = 2 * (ints[record + DETAILS] + 2 * ints[MAP_START])  # details follow planes; in 16-bit numbers
         surfels = (end - ints[record + PLANES]) // PLANE_SIZE
-    return _blocks(ints) + (surfels >> KEY_SHIFT) + 1
-
-
-@inlined
-def _is_smooth(runs, run):
-    kind = int(runs[run, CODE]) & 7
-    return (kind == MONOTONE or kind == OWN) and runs[run, RUN_BEND] < math.inf
-
-
-@inlined
-def _key(runs, run, blocks):
-    key = key_of(runs, run)
-    return BLOCKS_OF_A_LEAF * owner_of(runs, run) + key if _is_smooth(runs, run) else blocks + key
+    return (surfels >> KEY_SHIFT) + 1
 
 
 @unmanaged
-def order_runs(blob, ints, runs, used, bins, order, answers):
-    """Make runs ready and put their numbers in order: smooth ones by their blocks, then the others by their surfels.
+def most_keys(ints):
+    """Return how many keys there are of smooth runs and of others together."""
+    return 2 * _keys(ints)
 
-    order: (used,) and more; bins: (most_keys,) scratch. Returns how many are smooth: of one leaf, with a known bend.
-    answers: (used, ANSWER_SIZE), of each the next one is filled in, and its key for now.
+
+@unmanaged
+def order_runs(ints, runs, used, bins, order, answers):
+    """Put the numbers of runs in the order of their keys: smooth ones, then the others. Returns how many are smooth.
+
+    order: (used,) and more; bins: (most_keys,) scratch. answers: (used, ANSWER_SIZE), of each the next run is filled
+    in, and its key for now.
     """
-    blocks, total = _blocks(ints), 0
+    keys, total = _keys(ints), 0
     bins[:] = 0
     for run in range(used):
-        make_ready(blob, ints, runs, np.int64(run))
-        key = _key(runs, run, blocks)
+        key = key_of(runs, run) + (0 if is_smooth(runs, run) else keys)
         answers[run, ANSWER_PLACE], answers[run, ANSWER_NEXT] = key, int(runs[run, NEXT])
         bins[key] += 1
     for key in range(bins.shape[0]):
         total, bins[key] = total + bins[key], total
-    smooth = bins[blocks]
+    smooth = bins[keys]
     for run in range(used):
         key = answers[run, ANSWER_PLACE]
         order[bins[key]] = run
         bins[key] += 1
     return np.int64(smooth)
-
-
-@unmanaged
-def settle_smooth(blob, ints, tab, runs, used, order, smooth, later, tolerance, found, rows, answers):
-    """Settle the smooth runs, the first of the order, some at a time, in rounds: what one leaves open is the next's.
-
-    found: (k,) with room for all their crossings. Those that cannot be settled so are put behind the order's others;
-    returns where these end, and how many slots of found are used. later: (2, most) scratch (`most_runs`).
-    """
-    place, lost, todo, others = np.int64(0), np.int64(used) - smooth, smooth, order[smooth:]
-    now, then = later[0], later[1]
-    for q in range(smooth):
-        now[q] = order[q]
-    while todo > 0:
-        k = left = np.int64(0)
-        while k < todo:
-            m = np.int64(1)
-            while m < LANES and k + m < todo and runs[now[k + m], OWNER] == runs[now[k], OWNER]:
-                m += 1
-            for q in range(k + FAR_AHEAD, min(k + m + FAR_AHEAD, todo)):
-                ask_for_record(runs, now[q])
-            if k + m < todo:
-                ask_for_block(blob, ints, runs, now[k + m])
-            used, left, lost, place = improve_together(
-                blob, ints, tab, runs, used, now, k, m, then, left, others, lost, tolerance, rows, found, place, answers
-            )
-            k += m
-        todo, now, then = left, then, now
-    return smooth + lost, place
 
 
 @unmanaged
@@ -128,6 +90,87 @@ def most_runs(runs, used):
     for run in range(used):
         count += ((1 << HALVINGS) - 1) if int(runs[run, CODE]) & 7 == OWN else 0
     return np.int64(count)
+
+
+@inlined
+def _answer(answers, found, run, place, t, crossed):
+    """Keep the answer of a run that crosses at t, or nowhere; return where the next one goes."""
+    found[place] = t
+    answers[run, ANSWER_PLACE], answers[run, ANSWER_COUNT] = place, 1 if crossed else 0
+    return place + (1 if crossed else 0)
+
+
+@inlined
+def _put(runs, run, verdict, used, later, left, others, lost, answers):
+    """Put a run that has no answer yet where it goes: halves, of which one is the record `used`, are later ones.
+
+    Returns (used, left, lost). later, others: (n,), their ends left and lost.
+    """
+    if verdict == LOST:
+        runs[run, RUN_BEND] = np.inf
+        others[lost] = run
+        return used, left, lost + 1
+    halve(runs, run, used, verdict == HALVED_IN)
+    answers[used, ANSWER_NEXT], answers[run, ANSWER_NEXT] = answers[run, ANSWER_NEXT], used
+    later[left], later[left + 1] = run, used
+    return used + 1, left + 2, lost
+
+
+@unmanaged
+def settle_smooth(blob, ints, tab, runs, used, order, smooth, later, given, tolerance, found, rows, answers):
+    """Settle the smooth runs, the first of the order, in rounds: halves of one are runs of the next.
+
+    found: (k,) with room for all their crossings. Those that cannot be settled so are put behind the order's others;
+    returns where these end, and how many slots of found are used. later: (4, most), given: (most, LANES) scratch
+    (`most_runs`).
+    """
+    place, lost, todo, others = np.int64(0), np.int64(used) - smooth, smooth, order[smooth:]
+    now, then, exact, hard = later[0], later[1], later[2], later[3]
+    for q in range(smooth):
+        now[q] = order[q]
+    while todo > 0:
+        left = asked = hardest = np.int64(0)
+        for k in range(0, todo, LANES):
+            for q in range(k + FAR_AHEAD, min(k + FAR_AHEAD + LANES, todo)):
+                ask_for_record(runs, now[q])
+            for lane in range(LANES):
+                rows[RUN, lane] = now[min(k + lane, todo - 1)]
+            settle_by_cells(rows, runs, blob, ints, tab, tolerance)
+            for lane in range(min(LANES, todo - k)):
+                run, known = np.int64(now[k + lane]), rows[KNOWN, lane]
+                take_over(runs, run, rows, lane)
+                # Nothing predicts these, so that they are no branches.
+                place = _answer(answers, found, run, place, rows[AT, lane], known == SURE)
+                exact[asked] = run
+                give(rows, lane, given, asked)
+                asked += 1 if known == ONCE else 0
+                then[left] = run
+                left += 1 if known == AGAIN else 0
+                if known == ASKED:
+                    verdict = part(runs, run, rows[EXCESS, lane], rows[EXCESS_STRAY, lane])
+                    if verdict == OPEN:
+                        hard[hardest] = run
+                        hardest += 1
+                    else:
+                        used, left, lost = _put(runs, run, verdict, used, then, left, others, lost, answers)
+        for k in range(asked):
+            run = np.int64(exact[k])
+            if k + FAR_AHEAD < asked:
+                ask_for_record(runs, exact[k + FAR_AHEAD])
+            if ask_value(blob, runs, run, given, k, tolerance) == CROSSED:
+                place = _answer(answers, found, run, place, runs[run, GUESS], True)
+            else:
+                hard[hardest] = run
+                hardest += 1
+        for k in range(hardest):
+            run = np.int64(hard[k])
+            verdict = ask_formulas(blob, ints, runs, run, tolerance)
+            if verdict == CROSSED or verdict == CLEAR:
+                place = _answer(answers, found, run, place, runs[run, GUESS], verdict == CROSSED)
+            else:
+                used, left, lost = _put(runs, run, verdict, used, then, left, others, lost, answers)
+        todo, now, then = left, then, now
+    return smooth + lost, place
 
 
 @unmanaged
@@ -141,16 +184,14 @@ def settle_others(
     place = begun[1]
     for k in range(begun[0], used):
         run = np.int64(order[k])
-        if k + AHEAD < used:
-            ask_for_cells(ints, tab, runs, np.int64(order[k + AHEAD]))
         if k + FAR_AHEAD < used:
             ask_for_record(runs, order[k + FAR_AHEAD])
         if place + ROOM > found.shape[0]:
             begun[0], begun[1] = k, place
             return False
-        count = settle_run(
-            blob, ints, tab, runs, run, np.int64(0), resolution, tolerance, -np.inf, found[place : place + ROOM],
-            np.int64(0), work, slots, pending,
+        count = settle_other(
+            blob, ints, tab, runs, run, resolution, tolerance, -np.inf, found[place : place + ROOM], np.int64(0), work,
+            slots, pending,
         )  # fmt: skip
         if count > ROOM:
             answers[run, ANSWER_COUNT] = -1

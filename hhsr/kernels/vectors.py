@@ -88,6 +88,12 @@ class Vector:
     def __gt__(self, other: Vector | float) -> Vector:
         return self._compare(">", other)
 
+    def __le__(self, other: Vector | float) -> Vector:
+        return self._compare("<=", other)
+
+    def __ge__(self, other: Vector | float) -> Vector:
+        return self._compare(">=", other)
+
     def is_(self, other: Vector | float) -> Vector:
         """Return where two are equal; false where one is not a number."""
         return self._compare("==", other)
@@ -129,6 +135,10 @@ class Vector:
     def integers(self) -> Vector:
         """Return doubles as integers, towards 0."""
         return Vector(self.builder, self.builder.fptosi(self.value, _wide(INT, self.lanes)))
+
+    def longs(self) -> Vector:
+        """Return doubles as 64-bit integers, towards 0."""
+        return Vector(self.builder, self.builder.fptosi(self.value, _wide(LONG, self.lanes)))
 
     def bits(self) -> Any:
         """Return truths as one 64-bit integer, lane 0 the lowest bit."""
@@ -199,6 +209,25 @@ def gather_rows(builder: Any, table: Any, index: Vector, size: int) -> list[Vect
         Vector(builder, builder.shuffle_vector(rows[0], rows[0], ir.Constant(_wide(INT, index.lanes), column)))
         for column in columns
     ]
+
+
+def gather_columns(builder: Any, table: Any, index: Vector) -> list[Vector]:
+    """Return the elements from each lane's index on, one vector for each place: as many as there are lanes, a power of
+    two."""
+    row = _wide(table.type.pointee, index.lanes).as_pointer()
+    rows = [builder.load(builder.bitcast(_lane(builder, table, index, k), row), align=4) for k in range(index.lanes)]
+    step = 1
+    while step < index.lanes:  # squares of `step` beside the diagonal change places
+        places = range(index.lanes)
+        lower = ir.Constant(_wide(INT, index.lanes), [c if c & step == 0 else index.lanes + c - step for c in places])
+        upper = ir.Constant(_wide(INT, index.lanes), [c + step if c & step == 0 else index.lanes + c for c in places])
+        for k in places:
+            if k & step == 0:
+                one, other = rows[k], rows[k + step]
+                rows[k] = builder.shuffle_vector(one, other, lower)
+                rows[k + step] = builder.shuffle_vector(one, other, upper)
+        step *= 2
+    return [Vector(builder, row) for row in rows]
 
 
 def fetch_ahead(builder: Any, table: Any, index: Vector) -> None:

@@ -117,9 +117,9 @@ def go_on(blob, ints, tab, lanes, lane, first, alone, runs):
             # The end has its own state: along a cutting plane it may not be the one that the walk came with.
             holds = stop >= 1.0 and (state if sure else solid_contains(blob, ints, tab, np.int64(0), qx, qy, qz))
             if kind == NONE:
-                note(runs, lanes, lane, state, holds, stop)
+                note(blob, ints, runs, lanes, lane, state, holds, stop)
             else:
-                close(kind, runs, lanes, lane, state, holds, stop, last_surfel)
+                close(blob, ints, kind, runs, lanes, lane, state, holds, stop, last_surfel)
             state = holds
             break
         x, y, z = ux + t * vx, uy + t * vy, uz + t * vz
@@ -214,23 +214,23 @@ def go_on(blob, ints, tab, lanes, lane, first, alone, runs):
                 asked = int(runs[int(lanes[RUNS_USED, 0]), OWNER]) if foreign else owner
                 holds = _holds(blob, ints, asked, px + t * dx, py + t * dy, pz + t * dz)
                 if foreign:
-                    close(kind, runs, lanes, lane, state, holds, t, last_surfel)
+                    close(blob, ints, kind, runs, lanes, lane, state, holds, t, last_surfel)
                     state, kind = holds, np.int64(NONE)
                     continue  # look at this voxel again, without a run
-                note(runs, lanes, lane, state, holds, t)
+                note(blob, ints, runs, lanes, lane, state, holds, t)
                 state = holds
         last = owner if cut else -1
         if known != UNKNOWN:
             if kind == NONE:
-                note(runs, lanes, lane, state, known == 1, t)
+                note(blob, ints, runs, lanes, lane, state, known == 1, t)
             else:
-                close(kind, runs, lanes, lane, state, known == 1, t, last_surfel)
+                close(blob, ints, kind, runs, lanes, lane, state, known == 1, t, last_surfel)
             state, kind = known == 1, np.int64(NONE)
         if surfel >= 0 or known == UNKNOWN:
             kind = enter(kind, runs, lanes, a, max(a, b), owner, slope, stray, bend, guess)
             last_surfel = surfel
             if after != UNKNOWN:
-                close(kind, runs, lanes, lane, state, after == 1, max(a, b), surfel)
+                close(blob, ints, kind, runs, lanes, lane, state, after == 1, max(a, b), surfel)
                 state, kind = after == 1, np.int64(NONE)
         t = max(end, t) + nudge
         if not alone and kind == NONE and t < stop and not (first and lanes[FOUND, lane] < np.inf):
@@ -243,7 +243,7 @@ def go_on(blob, ints, tab, lanes, lane, first, alone, runs):
 
 
 @inlined
-def cross_voxel(ints, tab, lanes, lane, runs):
+def cross_voxel(blob, ints, tab, lanes, lane, runs):
     """Take a lane through the voxel where its stride ended if its surfel settles that; return whether it did.
 
     What `go_on` does most often: no run is pending, and the plane proves the state behind the voxel.
@@ -267,7 +267,7 @@ def cross_voxel(ints, tab, lanes, lane, runs):
         b = max(a, end - (abs(l1) - 1.0) / abs(slope))
         guess, bend = t - l0 / slope if slope != 0.0 else t, speed * speed * np.float64(tab[o + BEND])
         kind = enter(np.int64(NONE), runs, lanes, a, b, owner, slope * thick, stray, bend, guess)
-        close(kind, runs, lanes, lane, state, after, b, np.int64(surfel))
+        close(blob, ints, kind, runs, lanes, lane, state, after, b, np.int64(surfel))
         lanes[STATE, lane] = 1.0 if after else 0.0
     t = max(end, t) + lanes[NUDGED, lane]
     lanes[T, lane] = lanes[LEFT_AT, lane] = t

@@ -1,4 +1,4 @@
-"""The scale field along a line, of one direction and of eight side by side: the same bits, the formula's numbers."""
+"""The scale field along a line, eight centres at a time: the formula's numbers."""
 
 from __future__ import annotations
 
@@ -9,62 +9,35 @@ import numpy as np
 import pytest
 from llvmlite import ir
 
-from hhsr.kernels.along import (
-    ALONG_ROWS,
-    EXCESS,
-    PLACE,
-    RISE,
-    WAY,
-    emit_excess,
-    emit_field,
-    emit_fields,
-    excess_of,
-    ray_along,
-)
+from hhsr.kernels.along import emit_field, excess_of, ray_along
 from hhsr.kernels.sphere_rbf import scale_on_sphere
-from hhsr.kernels.vectors import LANES, load, store
+from hhsr.kernels.vectors import LANES
 
-Calls = tuple[object, object, object, object]
-FIELD, CHANGE = EXCESS, RISE  # where the functions of this test put the scale field
+FIELD, CHANGE, ALONE, SIZE = 6, 7, 8, 9  # of the functions' numbers: a direction, a way, and what is filled in
 
 
 @pytest.fixture(scope="module")
-def calls() -> Calls:
-    """What is emitted for one direction, for LANES, and for LANES points, as functions; and what keeps them."""
+def call() -> tuple[object, object]:
+    """What is emitted for a direction, with a way and without, as a function; and what keeps it."""
     double, long = ir.DoubleType(), ir.IntType(64)
     module = ir.Module()
     table = double.as_pointer()
-    one = ir.Function(module, ir.FunctionType(ir.VoidType(), [table, table, long]), "one")
-    builder = ir.IRBuilder(one.append_basic_block())
-    way = [builder.load(builder.gep(one.args[0], [ir.Constant(long, k)])) for k in range(6)]
-    sums = emit_field(builder, one.args[1], ir.Constant(long, 0), one.args[2], way[:3], way[3:])
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [table, table, long]), "field")
+    builder = ir.IRBuilder(function.append_basic_block())
+    numbers, block, count = function.args
+    way = [builder.load(builder.gep(numbers, [ir.Constant(long, k)])) for k in range(6)]
+    sums = emit_field(builder, block, ir.Constant(long, 0), count, way[:3], way[3:])
+    sums += emit_field(builder, block, ir.Constant(long, 0), count, way[:3], ())
     for k, total in enumerate(sums):
-        builder.store(total, builder.gep(one.args[0], [ir.Constant(long, 6 + k)]))
-    builder.ret_void()
-    many = ir.Function(module, ir.FunctionType(ir.VoidType(), [table, table, long, long]), "many")
-    builder = ir.IRBuilder(many.append_basic_block())
-    given = [load(builder, many.args[0], LANES * k) for k in range(6)]
-    for row, vector in zip(
-        (FIELD, CHANGE),
-        emit_fields(builder, many.args[1], ir.Constant(long, 0), *many.args[2:], given[:3], given[3:]),
-        strict=True,
-    ):
-        store(builder, vector, many.args[0], row * LANES)
-    builder.ret_void()
-    points = ir.Function(module, ir.FunctionType(ir.VoidType(), [table, table, long, long]), "points")
-    builder = ir.IRBuilder(points.append_basic_block())
-    emit_excess(builder, points.args[0], points.args[1], ir.Constant(long, 0), ir.Constant(long, 6), *points.args[2:])
+        builder.store(total, builder.gep(numbers, [ir.Constant(long, FIELD + k)]))
     builder.ret_void()
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     machine = llvm.Target.from_default_triple().create_target_machine()
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(str(module)), machine)
     engine.finalize_object()
-    pointer, integer = ctypes.c_void_p, ctypes.c_int64
-    of_one = ctypes.CFUNCTYPE(None, pointer, pointer, integer)(engine.get_function_address("one"))
-    of_many = ctypes.CFUNCTYPE(None, pointer, pointer, integer, integer)(engine.get_function_address("many"))
-    of_points = ctypes.CFUNCTYPE(None, pointer, pointer, integer, integer)(engine.get_function_address("points"))
-    return of_one, of_many, of_points, engine
+    kind = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
+    return kind(engine.get_function_address("field")), engine
 
 
 def block_of(rng: np.random.Generator, real: int) -> np.ndarray:
@@ -77,45 +50,35 @@ def block_of(rng: np.random.Generator, real: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("real", [0, 1, 8, 21, 40])
-def test_eight_directions_have_the_sums_of_each_and_of_the_formula(calls: Calls, real: int) -> None:
-    of_one, of_many, _, _ = calls
+def test_a_direction_has_the_sums_of_the_formula(call: tuple[object, object], real: int) -> None:
     rng = np.random.default_rng(real)
     block = block_of(rng, real)
-    count = block.shape[1]
-    rows = np.full((ALONG_ROWS, LANES), np.nan)
-    unit = rng.normal(size=(3, LANES))
-    unit /= np.sqrt((unit**2).sum(axis=0))
-    way = rng.normal(size=(3, LANES))
-    rows[:3], rows[3:6] = unit, way - (way * unit).sum(axis=0) * unit
-    of_many(rows.ctypes.data, block.ctypes.data, count, real)  # type: ignore[operator]
-    for lane in range(LANES):
-        own = np.ascontiguousarray(rows[:, lane])
-        own[FIELD:] = np.nan
-        of_one(own.ctypes.data, block.ctypes.data, count)  # type: ignore[operator]
-        assert np.array_equal(own[[FIELD, CHANGE]], rows[[FIELD, CHANGE], lane])
-        at, along = rows[:3, lane], rows[3:6, lane]
+    size = np.abs(block[4]).sum()
+    for _ in range(8):
+        unit, way = rng.normal(size=(2, 3))
+        unit /= np.sqrt(unit @ unit)
+        way -= (way @ unit) * unit
+        numbers = np.full(SIZE, np.nan)
+        numbers[:6] = *unit, *way
+        call[0](numbers.ctypes.data, block.ctypes.data, block.shape[1])  # type: ignore[operator]
         formula = [
-            scale_on_sphere(*(at + step * along), block[:3].T.copy(), block[3], block[4]) for step in (0.0, 1e-6, -1e-6)
+            scale_on_sphere(*(unit + step * way), block[:3].T.copy(), block[3], block[4]) for step in (0.0, 1e-6, -1e-6)
         ]
-        size = np.abs(block[4]).sum()
-        assert rows[FIELD, lane] == pytest.approx(formula[0], abs=1e-13 * (1 + size))
-        assert rows[CHANGE, lane] == pytest.approx((formula[1] - formula[2]) / 2e-6, abs=1e-5 * (1 + size))
+        assert numbers[FIELD] == numbers[ALONE] == pytest.approx(formula[0], abs=1e-13 * (1 + size))
+        assert numbers[CHANGE] == pytest.approx((formula[1] - formula[2]) / 2e-6, abs=1e-5 * (1 + size))
 
 
-@pytest.mark.parametrize("real", [0, 5, 16])
-def test_eight_points_have_the_value_and_slope_of_each(calls: Calls, real: int) -> None:
-    of_one, _, of_points, _ = calls
-    rng = np.random.default_rng(real)
-    block = block_of(rng, real)
-    block[4] *= 0.05
-    blob = np.concatenate([rng.uniform(20.0, 60.0, 6), block.ravel()])
-    rows = np.full((ALONG_ROWS, LANES), np.nan)
-    rows[PLACE : PLACE + 3], rows[WAY : WAY + 3] = rng.normal(size=(3, LANES)) * 40, rng.normal(size=(3, LANES)) * 90
-    of_points(rows.ctypes.data, blob.ctypes.data, block.shape[1], real)  # type: ignore[operator]
-    for lane in range(LANES):
-        place, way = rows[PLACE : PLACE + 3, lane].tolist(), rows[WAY : WAY + 3, lane].tolist()
+def test_f_and_its_change_are_those_of_the_formula() -> None:
+    """F = N/(1 − s), with a change of s that is told: against its difference a little farther on."""
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        half_axes, s, ds = rng.uniform(20.0, 60.0, 6), rng.uniform(-0.3, 0.3), rng.normal() * 0.1
+        place, way = rng.normal(size=(2, 3)) * 40
         unit, tangent = ray_along(*place, *way)
-        own = np.array([*unit, *tangent, np.nan, np.nan])
-        of_one(own.ctypes.data, block.ctypes.data, block.shape[1])  # type: ignore[operator]
-        alone = excess_of(blob, 0, *place, *way, own[FIELD], own[CHANGE])
-        assert (rows[EXCESS, lane], rows[RISE, lane]) == alone
+        assert np.dot(unit, tangent) == pytest.approx(0.0, abs=1e-9)
+        f, change = excess_of(half_axes, 0, *place, *way, s, ds)
+        sides = np.where(place > 0.0, half_axes[::2], half_axes[1::2])
+        norms = [np.sqrt(np.sum(((place + step * way) / sides) ** 2)) for step in (0.0, 1e-6, -1e-6)]
+        assert f == pytest.approx(norms[0] / (1.0 - s) - 1.0, abs=1e-12)
+        ahead, behind = norms[1] / (1.0 - s - 1e-6 * ds), norms[2] / (1.0 - s + 1e-6 * ds)
+        assert change == pytest.approx((ahead - behind) / 2e-6, abs=1e-6)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numba import config
 
-from hhsr.kernels.along import ALONG_ROWS
+from hhsr.kernels.cell_along import CELL_ROWS
 from hhsr.kernels.crossing import scratch
 from hhsr.kernels.lane import BEGIN, FIRST_RUN, MERGE, ROWS, RUNS_USED, set_out
 from hhsr.kernels.layout import integers, tables
@@ -51,13 +51,13 @@ def test_many_segments_have_the_crossings_of_each(name: str) -> None:
     used = int(lanes[RUNS_USED, 0])
     most = int(most_runs(runs, used))
     assert used <= most <= len(runs)
-    order, later = np.empty(2 * most, dtype=np.int32), np.empty((2, most), dtype=np.int32)
+    order, later = np.empty(2 * most, dtype=np.int32), np.empty((4, most + 1), dtype=np.int32)
     bins, answers = np.empty(most_keys(ints), dtype=np.int32), np.empty((most, ANSWER_SIZE), dtype=np.int32)
-    smooth = int(order_runs(blob, ints, runs, used, bins, order, answers))
+    smooth = int(order_runs(ints, runs, used, bins, order, answers))
     assert sorted(order[:used].tolist()) == list(range(used))
     found, ts = np.empty(ROOM * (most + 1)), np.empty(ROOM * (most + 1))
-    rows = np.empty((ALONG_ROWS, LANES))
-    end, settled = settle_smooth(blob, ints, tab, runs, used, order, smooth, later, 0.001, found, rows, answers)
+    rows, given = np.zeros((CELL_ROWS, LANES)), np.empty((most + 1, LANES))
+    end, settled = settle_smooth(blob, ints, tab, runs, used, order, smooth, later, given, 0.001, found, rows, answers)
     begun = np.array([smooth, settled])
     assert settle_others(blob, ints, tab, runs, order, end, begun, 0.01, 0.001, found, work, slots, pending, answers)
     for i in range(COUNT):
