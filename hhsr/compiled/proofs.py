@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from hhsr.compiled.blob import appended, read_only
+from hhsr.compiled.blob import LINE, appended, read_only
 from hhsr.compiled.edges import straight_edges
 from hhsr.compiled.leaf_maps import fill_leaf_maps
 from hhsr.compiled.records import Owner, Records
@@ -15,8 +15,9 @@ from hhsr.kernels import layout as at
 from hhsr.kernels import slab as slab_at
 from hhsr.kernels import voxels as voxel_at
 from hhsr.kernels.crossing import first_exits
+from hhsr.kernels.disc_bounds import DISC_SIZE, WIDE
 from hhsr.kernels.disc_order import order_facets
-from hhsr.kernels.discs import DISC_SIZE, WIDE, fill_discs, level_sizes
+from hhsr.kernels.discs import fill_discs, level_sizes
 from hhsr.kernels.facets import list_facets
 from hhsr.kernels.region_box import leaf_box, part_box
 from hhsr.kernels.seeds import fill_seeds
@@ -61,11 +62,14 @@ class Proofs(Records):
         per_level = -(-sizes // WIDE)
         blocks = np.full((int(per_level.sum()), DISC_SIZE, WIDE), EMPTY, dtype=np.float32)
         fill_discs(disc, sizes, blocks)
+        blob = appended(blob, np.zeros(-len(blob) % LINE))  # codes of a block are two lines of the cache, a row is one
         head, start = self.header(blob), len(blob)
         head[at.FACET_COUNT], head[at.FACET_CODES], head[at.FACET_LEVELS] = len(code), start, start + len(code)
-        first = 2 * (start + len(code) + 3 + 2 * len(sizes) - int(head[at.MAP_START]))
+        end = start + len(code) + 3 + 2 * len(sizes)
+        gap = -end % LINE
+        first = 2 * (end + gap - int(head[at.MAP_START]))
         levels = np.column_stack([np.concatenate([[0], np.cumsum(per_level)[:-1]]), sizes]).ravel()
-        numbers = np.concatenate([code, [len(sizes)], levels, [first, len(blocks)]]).astype(np.int64)
+        numbers = np.concatenate([code, [len(sizes)], levels, [first, len(blocks)], np.zeros(gap)]).astype(np.int64)
         grown = appended(appended(blob, numbers), blocks)
         return self._with_seeds(grown, disc)
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from hhsr.kernels.discs import WIDE
+from hhsr.kernels.disc_bounds import WIDE
 from hhsr.kernels.unmanaged import unmanaged
 
 DEEP = 128  # pending ranges: two a halving would do

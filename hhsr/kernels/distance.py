@@ -12,7 +12,7 @@ from numba import njit
 
 from hhsr.kernels.by_charts import nearest_by_charts
 from hhsr.kernels.descent import onto_surface
-from hhsr.kernels.discs import WIDE
+from hhsr.kernels.disc_bounds import WIDE
 from hhsr.kernels.foot import FREE, UNPROVEN
 from hhsr.kernels.layout import (
     EDGE_COUNT,

@@ -7,7 +7,7 @@ its flat quad, widened by its proven thickness, does; what is left is settled at
 import numpy as np
 
 from hhsr.kernels.descent import descend, onto_surface
-from hhsr.kernels.discs import BLOCK, DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment, lowest_bit
+from hhsr.kernels.disc_bounds import BLOCK, LOOSE, WIDE, bound_to_point, bound_to_segment
 from hhsr.kernels.facets import facet_cell, facet_slot
 from hhsr.kernels.flat_cell import refine_cell
 from hhsr.kernels.layout import (
@@ -49,7 +49,7 @@ from hhsr.kernels.seeds import seed_at
 from hhsr.kernels.settle import settle_cell
 from hhsr.kernels.tree import turn_out_of_leaf
 from hhsr.kernels.unmanaged import inlined, unmanaged
-from hhsr.kernels.vectors import ask_ahead
+from hhsr.kernels.vectors import ask_ahead, lowest_bit
 
 VAST = 1e9  # mm
 ROUNDING = 1e-9  # of the coordinates
@@ -133,7 +133,7 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
     x, y, z = search[START], search[START + 1], search[START + 2]
     dx, dy, dz = search[VECTOR], search[VECTOR + 1], search[VECTOR + 2]
     first = ints[levels + 1 + 2 * ints[levels]]
-    blocks = tab[first : first + BLOCK * ints[levels + 2 + 2 * ints[levels]]].reshape(-1, DISC_SIZE, WIDE)
+    blocks = tab[first : first + BLOCK * ints[levels + 2 + 2 * ints[levels]]]
     bounds = keys[LATE + NODE_ROOM :].view(np.float32)
     reach = max(abs(x), abs(y), abs(z)) + max(abs(x + dx), abs(y + dy), abs(z + dz))
     # From 10 km on the squares of distances round to more than the tolerance.
@@ -141,8 +141,10 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
     local[LENGTH2], local[TOLERANCE] = search[LENGTH2], search[TOLERANCE]
     loose = LOOSE * (reach + blob[ints[SEED_FRAME] + 4])
     limit = search[BEST] - search[TOLERANCE]
-    depth, waiting = 1, 0
-    nodes[0], keys[0] = (ints[levels] - 1) << 40, 0.0
+    depth, waiting = 0, 0
+    while WIDE * depth < ints[levels + 2 * ints[levels]]:
+        keys[depth], nodes[depth] = 0.0, ((ints[levels] - 1) << 40) + depth
+        depth += 1
     mask = np.int64(0)
     while depth > 0 or waiting > 0:
         depth -= 1
@@ -153,12 +155,13 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
                 bounds[:] = np.float32(0.0)
                 mask = np.int64((1 << WIDE) - 1)
             elif moving:
-                mask = np.int64(bound_to_segment(blocks, start + i, x, y, z, dx, dy, dz, loose, limit * limit, bounds))
+                mask = bound_to_segment(blocks, start + i, x, y, z, dx, dy, dz, loose, limit * limit, bounds)
             else:
-                mask = np.int64(bound_to_point(blocks, start + i, x, y, z, loose, limit * limit, bounds))
+                mask = bound_to_point(blocks, start + i, x, y, z, loose, limit * limit, bounds)
             base = depth
             while mask != 0:
-                c, mask = lowest_bit(mask)
+                c = lowest_bit(mask)
+                mask &= mask - 1
                 if WIDE * i + c >= size:
                     continue
                 low = np.float64(bounds[c])
@@ -171,6 +174,13 @@ def nearest_on_leaves(blob, ints, tab, search, local, nodes, keys, corners, spar
                     ask_ahead(tab, slot + CELL_SIZE - 1)
                     waiting += 1
                     continue
+                if level == 1:  # so do a block of them and their codes
+                    child = WIDE * i + c
+                    slot = first + BLOCK * (ints[levels + 1] + child)
+                    for line in range(slot, slot + BLOCK, WIDE):
+                        ask_ahead(tab, line)
+                    ask_ahead(ints, codes + WIDE * child)
+                    ask_ahead(ints, codes + WIDE * child + WIDE // 2)
                 # Inserted so that the nearest is next.
                 k = depth
                 while k > base and keys[k - 1] < low:

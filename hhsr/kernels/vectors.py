@@ -73,10 +73,12 @@ class Vector:
         return Vector(self.builder, self.builder.not_(self.value))
 
     def __abs__(self) -> Vector:
-        """Return the sizes of doubles."""
-        bits = self.builder.bitcast(self.value, _wide(LONG, self.lanes))
-        bits = self.builder.and_(bits, ir.Constant(_wide(LONG, self.lanes), [0x7FFFFFFFFFFFFFFF] * self.lanes))
-        return Vector(self.builder, self.builder.bitcast(bits, self.value.type))
+        """Return the sizes of doubles or floats."""
+        kind = self.value.type
+        return Vector(
+            self.builder,
+            self.builder.call(_intrinsic(self.builder, f"llvm.fabs.{_name(self)}", kind, [kind]), [self.value]),
+        )
 
     def _compare(self, sign: str, other: Vector | float) -> Vector:
         compare = self.builder.fcmp_ordered if self.floats else self.builder.icmp_signed
@@ -85,11 +87,11 @@ class Vector:
     def __lt__(self, other: Vector | float) -> Vector:
         return self._compare("<", other)
 
-    def __gt__(self, other: Vector | float) -> Vector:
-        return self._compare(">", other)
-
     def __le__(self, other: Vector | float) -> Vector:
         return self._compare("<=", other)
+
+    def __gt__(self, other: Vector | float) -> Vector:
+        return self._compare(">", other)
 
     def __ge__(self, other: Vector | float) -> Vector:
         return self._compare(">=", other)
@@ -147,21 +149,26 @@ class Vector:
 
 
 def fused(factor: Vector, other: Vector | float, more: Vector | float) -> Vector:
-    """Return factor·other + more of doubles, rounded once."""
+    """Return factor·other + more of doubles or floats, rounded once."""
     kind = factor.value.type
-    function = _intrinsic(factor.builder, f"llvm.fma.v{factor.lanes}f64", kind, [kind] * 3)
+    function = _intrinsic(factor.builder, f"llvm.fma.{_name(factor)}", kind, [kind] * 3)
     return Vector(
         factor.builder, factor.builder.call(function, [factor.value, factor._right(other), factor._right(more)])
     )
 
 
 def root(number: Vector) -> Vector:
-    """Return the square root of doubles, correctly rounded."""
+    """Return the square root of doubles or floats, correctly rounded."""
     kind = number.value.type
     return Vector(
         number.builder,
-        number.builder.call(_intrinsic(number.builder, f"llvm.sqrt.v{number.lanes}f64", kind, [kind]), [number.value]),
+        number.builder.call(_intrinsic(number.builder, f"llvm.sqrt.{_name(number)}", kind, [kind]), [number.value]),
     )
+
+
+def _name(numbers: Vector) -> str:
+    """Return how LLVM's functions call vectors of these doubles or floats."""
+    return f"v{numbers.lanes}f{64 if numbers.value.type.element == DOUBLE else 32}"
 
 
 def _intrinsic(builder: Any, name: str, result: Any, kinds: list[Any]) -> Any:
@@ -268,11 +275,19 @@ def bits_set(typing: Any, number: Any) -> Any:
     return types.int64(types.int64), lambda context, builder, signature, arguments: builder.ctpop(arguments[0])
 
 
-@intrinsic
-def lowest_bit(typing: Any, number: Any) -> Any:
+def lowest_bit(number: Any) -> Any:
     """Return which bit of a number that is not 0 is the lowest that is set."""
+    return int(number & -number).bit_length() - 1
 
+
+@intrinsic
+def _lowest_bit(typing: Any, number: Any) -> Any:
     def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
 
     return types.int64(types.int64), emit
+
+
+@overload(lowest_bit, inline="always")
+def _compiled_lowest_bit(number):
+    return lambda number: _lowest_bit(number)

@@ -10,8 +10,8 @@ from hhsr.batches import FEW, by_middles, neighbours_first
 from hhsr.compiled import compile_tree
 from hhsr.kernels import layout as at
 from hhsr.kernels.descent import onto_surface
+from hhsr.kernels.disc_bounds import WIDE
 from hhsr.kernels.disc_order import order_facets
-from hhsr.kernels.discs import WIDE
 from hhsr.kernels.distance import set_search
 from hhsr.kernels.layout import integers, tables
 from hhsr.kernels.nearest import seed_point

@@ -12,7 +12,7 @@ from hhsr.compiled import compile_tree
 from hhsr.kernels import layout as at
 from hhsr.kernels.cell import direction_of, inverse_radius
 from hhsr.kernels.clipped_quadratic import clipped_is_clear, least_over_polygon
-from hhsr.kernels.discs import DISC_SIZE, LOOSE, WIDE, bound_to_point, bound_to_segment, lowest_bit
+from hhsr.kernels.disc_bounds import BLOCK, LOOSE, WIDE, bound_to_point, bound_to_segment
 from hhsr.kernels.facets import facet_cell
 from hhsr.kernels.foot import jump_over, leaf_is_free
 from hhsr.kernels.jet import inverse_radius_bend
@@ -288,7 +288,7 @@ def test_discs_hold_their_facets_at_every_level(seed: int) -> None:
     ints, tab = integers(blob), tables(blob)
     levels, codes = ints[at.FACET_LEVELS], ints[at.FACET_CODES]
     first, count = ints[levels + 1 + 2 * ints[levels] : levels + 3 + 2 * ints[levels]]
-    blocks = tab[first : first + count * DISC_SIZE * WIDE].reshape(-1, DISC_SIZE, WIDE)
+    blocks = tab[first : first + count * BLOCK]
     bounds = np.empty(WIDE, dtype=np.float32)
     for q in rng.integers(ints[at.FACET_COUNT], size=60):
         code = ints[codes + q]
@@ -316,15 +316,6 @@ def test_discs_hold_their_facets_at_every_level(seed: int) -> None:
                 bound_to_segment(blocks, block, *query, *vector, loose, 1e30, bounds)
                 assert bounds[place % WIDE] <= true * true * (1 + 1e-6)
                 place //= WIDE
-
-
-def test_the_lowest_bit_of_a_mask() -> None:
-    for mask in [1, 2, 3, 0x8000, 0xFFFF, 0xFFFFFFFF, *np.random.default_rng(0).integers(1, 2**32, 50)]:
-        found, rest = [], np.uint32(mask)
-        while rest != 0:
-            place, rest = lowest_bit(np.uint32(rest))
-            found.append(int(place))
-        assert found == [k for k in range(32) if int(mask) >> k & 1]
 
 
 def test_a_point_beyond_what_single_precision_holds_has_its_distance() -> None:
