@@ -20,10 +20,17 @@ from hhsr.kernels.spans import close_spans, put_span, summit_of, tell_spans
 from hhsr.kernels.tree import into_tree, out_of_tree
 from hhsr.kernels.unmanaged import managed, unmanaged
 
+DEPTH = 0.88  # tolerances: a tenth is what the walk to the ends of a stretch may err
 ROUGHLY = 6.0  # tolerances: as nearly as a foot is sought that is to lower a bound of the depth
 PATIENCE = 2  # ways on, one after another, that lower a bound of the depth by little
 LITTLE = 0.3  # of what is open
-FIRST_SUMMIT = 9  # parts: then it is asked where it is likely deepest, and at each twice as many
+NEAR = 0.5  # tolerances: a bound is lowered only by a point that is nearer by this
+CLOSE = 0.85  # tolerances: as nearly as the distance is asked where a bound is highest; the rest closes spans beside
+NEARER = 0.3  # tolerances: a point nearer by this than what was known leaves too little to close them: a search may end
+AWAY = 4.0  # tolerances: so does one that is nearer by this where it was likely deepest
+SAME = 1.0  # tolerances: where a search found so little, ways on find nothing
+WALKED = 0.12  # tolerances: deeper than what may lie outside between a walked end and the surface
+FIRST_SUMMIT = 7  # parts: then it is asked where it is likely deepest, and at each twice as many
 ROOM = 0.65  # tolerances: as nearly as the distance is asked there; what is left, and the slack, go to a moved segment
 SLACK = 0.1  # tolerances: as much as the walk of a moved segment may err
 SPANS = 256  # parts of one segment's stretch inside
@@ -99,7 +106,7 @@ def deepest(
     no more is the true distance asked, as nearly as the bound leaves room for. on0, on1: the ends lie on the surface.
     out: best t and foot (4,).
     """
-    near = 0.25 * tolerance
+    near = NEAR * tolerance
     sure = 0.0  # a depth that is reached
     for k in range(2):
         t = t0 if k == 0 else t1
@@ -127,7 +134,7 @@ def deepest(
         t = spans[s, 9]
         if value <= max(sure + tolerance, floor) or used == spans.shape[0] or turn == 2 * SPANS - 1:
             break
-        climbs = turn == summit
+        climbs, proven = turn == summit, False
         if climbs:
             summit *= 2
             s, t = summit_of(spans, used, px, py, pz, dx, dy, dz, s, t)
@@ -146,12 +153,13 @@ def deepest(
             slow = slow + 1 if value - search[BEST] < LITTLE * (value - sure) else np.int64(0)
         if not known:
             # Nothing nearer is known, or little by little: what is the true distance there?
-            slow = np.int64(0)
-            room = ROOM * tolerance if climbs else 0.9 * tolerance - max(value - search[BEST], 0.0)
-            # A place where it is much less deep than the bound says is not the deepest: what is nearer there will do.
-            search[TOLERANCE], search[ENOUGH] = room, 0.0 if climbs else value - tolerance
+            before = search[BEST]
+            room = ROOM * tolerance if climbs else CLOSE * tolerance - max(value - before, 0.0)
+            # A place where it is less deep than the bound says is not the deepest: what is nearer there will do.
+            search[TOLERANCE], search[ENOUGH] = room, before - (AWAY if climbs else NEARER) * tolerance
             proven = search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, np.bool_(True))
-            if proven and search[BEST] - room > sure:
+            slow = np.int64(PATIENCE) if before - search[BEST] < SAME * tolerance else np.int64(0)
+            if proven and search[BEST] - room > max(sure, WALKED * tolerance):
                 sure = search[BEST] - room
                 if search[BEST] > floor:
                     out[0], out[1], out[2], out[3] = t, search[FOOT], search[FOOT + 1], search[FOOT + 2]
@@ -166,7 +174,7 @@ def deepest(
         else:
             put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, b, x, y, z)
         tell_spans(spans, used, px, py, pz, dx, dy, dz, x, y, z)
-        if climbs:
+        if climbs and proven:
             # `sure` only rises, so that what is closed now is near enough at the end.
             closed = max(sure + tolerance, floor)
             used = lift(
@@ -174,6 +182,18 @@ def deepest(
                 work, slots, pending,
             )  # fmt: skip
     return max(floor, value, closed)
+
+
+@unmanaged
+def _longest_stretch(ts, count, inside):
+    """Return which of the stretches that `count` crossings part a segment into is the longest inside."""
+    longest, length, begin = 0, -1.0, 0.0
+    for k in range(min(count, ts.shape[0]) + 1):
+        end = ts[k] if k < count else 1.0
+        if inside and end - begin > length:
+            longest, length = k, end - begin
+        inside, begin = not inside, end
+    return longest
 
 
 @unmanaged
@@ -192,17 +212,22 @@ def _clearance(
         search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, np.bool_(False))
         out[0], out[1], out[2], out[3] = search[BEST_T], search[FOOT], search[FOOT + 1], search[FOOT + 2]
         return search[BEST] - search[TOLERANCE]
-    deep, begin = 0.0, 0.0
     out[0], out[1], out[2], out[3] = 0.0, np.nan, np.nan, np.nan
-    for k in range(min(count, ts.shape[0]) + 1):
-        end = ts[k] if k < count else 1.0
-        if inside and end >= begin:
-            deep = max(
-                deep,
-                deepest(blob, ints, tab, px, py, pz, dx, dy, dz, begin, end, k > 0, k < count, 0.8 * tolerance, deep,
-                        out, search, local, nodes, keys, corners, spare, rects, spans, lifted, work, slots, pending),
-            )  # fmt: skip
-        inside, begin = not inside, end
+    # The longest stretch inside first: most others are no deeper by their ends alone.
+    deep, longest = 0.0, _longest_stretch(ts, count, inside)
+    for others in range(2):
+        begin, within = 0.0, inside
+        for k in range(min(count, ts.shape[0]) + 1):
+            end = ts[k] if k < count else 1.0
+            if within and end >= begin and (k != longest) == (others == 1):
+                deep = max(
+                    deep,
+                    deepest(
+                        blob, ints, tab, px, py, pz, dx, dy, dz, begin, end, k > 0, k < count, DEPTH * tolerance, deep,
+                        out, search, local, nodes, keys, corners, spare, rects, spans, lifted, work, slots, pending,
+                    ),
+                )  # fmt: skip
+            within, begin = not within, end
     return -deep - 0.1 * tolerance
 
 
