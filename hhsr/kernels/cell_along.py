@@ -289,10 +289,13 @@ def _cell(on: Any, valid: Any, leaf: Sequence[Any], face: Any, a: Any, b: Any) -
     return cell, half, ((i * s + p) * 2.0 + 1.0) * half - 1.0, ((j * s + q) * 2.0 + 1.0) * half - 1.0, block
 
 
-def emit_settled(builder: Any, rows: Any, runs: Any, blob: Any, ints: Any, tab: Any, tolerance: Any) -> None:
-    """Emit rows KNOWN … COUNT of the runs whose numbers are in row RUN."""
-    on = Emitted(builder, runs, blob, ints, tab)
-    for k, row in enumerate(settled(on, load(builder, rows, RUN * LANES), Vector.of(builder, tolerance))):
+def emit_settled(
+    builder: Any, lanes: int, rows: Any, runs: Any, blob: Any, ints: Any, tab: Any, tolerance: Any
+) -> None:
+    """Emit rows KNOWN … COUNT of the runs whose numbers are in row RUN, in the first lanes."""
+    on = Emitted(builder, lanes, runs, blob, ints, tab)
+    numbers = load(builder, rows, RUN * LANES, lanes)
+    for k, row in enumerate(settled(on, numbers, Vector.of(builder, tolerance, lanes))):
         store(builder, row, rows, (KNOWN + k) * LANES)
 
 
@@ -303,19 +306,30 @@ if config.DISABLE_JIT:  # type: ignore[attr-defined]
         with np.errstate(all="ignore"):
             rows[KNOWN:GIVEN] = settled(Counted(runs, blob, ints, tab), rows[RUN], tolerance)
 
+    def settle_by_cell(rows: Any, runs: Any, blob: Any, ints: Any, tab: Any, tolerance: float) -> None:
+        """Do so for the first lane."""
+        rows[RUN] = rows[RUN, 0]
+        settle_by_cells(rows, runs, blob, ints, tab, tolerance)
+
 else:
 
-    @intrinsic
-    def settle_by_cells(typing: Any, rows: Any, runs: Any, blob: Any, ints: Any, tab: Any, tolerance: Any) -> Any:
-        """Fill rows KNOWN … COUNT (CELL_ROWS, LANES) of the runs whose numbers are in row RUN. tolerance: mm."""
-        signature = types.void(rows, runs, blob, ints, tab, tolerance)
-
+    def _emitter(signature: Any, lanes: int) -> Any:
         def emit(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
             rows, runs, blob, ints, tab = (
                 context.make_array(kind)(context, builder, value).data
                 for kind, value in zip(signature.args[:5], arguments[:5], strict=True)
             )
-            emit_settled(builder, rows, runs, blob, ints, tab, arguments[5])
+            emit_settled(builder, lanes, rows, runs, blob, ints, tab, arguments[5])
             return context.get_dummy_value()
 
         return signature, emit
+
+    @intrinsic
+    def settle_by_cells(typing: Any, rows: Any, runs: Any, blob: Any, ints: Any, tab: Any, tolerance: Any) -> Any:
+        """Fill rows KNOWN … COUNT (CELL_ROWS, LANES) of the runs whose numbers are in row RUN. tolerance: mm."""
+        return _emitter(types.void(rows, runs, blob, ints, tab, tolerance), LANES)
+
+    @intrinsic
+    def settle_by_cell(typing: Any, rows: Any, runs: Any, blob: Any, ints: Any, tab: Any, tolerance: Any) -> Any:
+        """Do so for the first lane: to the same bits, but much less code, which a single call finds far away."""
+        return _emitter(types.void(rows, runs, blob, ints, tab, tolerance), 1)

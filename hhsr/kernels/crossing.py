@@ -14,7 +14,7 @@ from hhsr.kernels.lane import BEGIN, FIRST_RUN, GAP, LAST_RUN, MERGE, ROWS, RUNS
 from hhsr.kernels.layout import VOXELS, integers, tables
 from hhsr.kernels.runs import HALVINGS, RUN_SIZE
 from hhsr.kernels.segment import PIECES, emit
-from hhsr.kernels.settle_run import ask_cells, settle_run
+from hhsr.kernels.settle_run import settle_run
 from hhsr.kernels.tree import into_tree
 from hhsr.kernels.unmanaged import unmanaged
 from hhsr.kernels.vectors import LANES
@@ -30,9 +30,9 @@ LANE_ROWS = PIECES + ROWS
 def scratch():
     """Return (work, slots, pending): what one thread needs to follow segments.
 
-    Rows of work: PIECES for bisections, ROWS for lanes, CELL_ROWS twice, the rest for the runs of a segment alone.
+    Rows of work: PIECES for bisections, ROWS for lanes, CELL_ROWS, the rest for the runs of a segment alone.
     """
-    work = np.empty((LANE_ROWS + 2 * CELL_ROWS + (RUNS + HALVINGS) * RUN_SIZE // LANES, LANES))
+    work = np.empty((LANE_ROWS + CELL_ROWS + (RUNS + HALVINGS) * RUN_SIZE // LANES, LANES))
     work[PIECES:LANE_ROWS] = 0.0
     return work, np.empty((SLOTS, 2)), np.empty(SLOTS, dtype=np.int64)
 
@@ -43,8 +43,7 @@ def _walk(
 ):  # fmt: skip
     """Return (start state, count) of a segment of some length by the walk of the voxels; count −1: too many runs."""
     lanes, rows = work[PIECES:LANE_ROWS], work[LANE_ROWS : LANE_ROWS + CELL_ROWS]
-    more = work[LANE_ROWS + CELL_ROWS : LANE_ROWS + 2 * CELL_ROWS]
-    runs = work[LANE_ROWS + 2 * CELL_ROWS :].reshape(RUNS + HALVINGS, RUN_SIZE)
+    runs = work[LANE_ROWS + CELL_ROWS :].reshape(RUNS + HALVINGS, RUN_SIZE)
     if not set_out(blob, ints, lanes, 0, px, py, pz, ex, ey, ez, length):
         return False, np.int64(0)
     lanes[RUNS_USED, 0] = 0.0
@@ -53,13 +52,10 @@ def _walk(
         done = go_on(blob, ints, tab, lanes, np.int64(0), first, np.bool_(True), runs[:RUNS])
         if lanes[SPILLED, 0] > 0.0:
             return False, np.int64(-1)
-        used = np.int64(lanes[RUNS_USED, 0])
-        for run in range(used):
-            if run % LANES == 0:
-                ask_cells(blob, ints, tab, runs, run, used, tolerance, rows)
+        for run in range(int(lanes[RUNS_USED, 0])):
             count = settle_run(
-                blob, ints, tab, runs, run, np.int64(RUNS), resolution, tolerance, gap, out, count, work, slots,
-                pending, rows, run % LANES, more,
+                blob, ints, tab, runs, np.int64(run), np.int64(RUNS), resolution, tolerance, gap, out, count, work,
+                slots, pending, rows,
             )  # fmt: skip
         lanes[RUNS_USED, 0], lanes[FIRST_RUN, 0], lanes[LAST_RUN, 0] = 0.0, -1.0, -1.0
     return lanes[BEGIN, 0] > 0.0, min(count, np.int64(1)) if first else count

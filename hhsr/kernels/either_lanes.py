@@ -16,15 +16,16 @@ from hhsr.kernels.vectors import DOUBLE, LONG, Vector, fused, gather, gather_col
 
 
 class Emitted:
-    """Lanes of code that a builder of LLVM's emits."""
+    """Lanes of code that a builder of LLVM's emits: LANES, or one, with the same bits."""
 
-    def __init__(self, builder: Any, runs: Any, blob: Any, ints: Any, tab: Any) -> None:
-        self.builder, self.runs, self.blob, self.ints, self.tab = builder, runs, blob, ints, tab
+    def __init__(self, builder: Any, lanes: int, runs: Any, blob: Any, ints: Any, tab: Any) -> None:
+        self.builder, self.lanes = builder, lanes
+        self.runs, self.blob, self.ints, self.tab = runs, blob, ints, tab
         self.one = self.number(1.0)
         self.fused, self.root = fused, root
 
     def number(self, value: float) -> Vector:
-        return Vector.of(self.builder, ir.Constant(DOUBLE, value))
+        return Vector.of(self.builder, ir.Constant(DOUBLE, value), self.lanes)
 
     def where(self, truth: Vector, yes: Vector, no: Vector | float) -> Vector:
         return truth.where(yes, no)
@@ -45,22 +46,22 @@ class Emitted:
         return numbers.doubles()
 
     def power(self, exponent: Vector) -> Vector:
-        return Vector.of(self.builder, ir.Constant(LONG, 1)) << exponent
+        return Vector.of(self.builder, ir.Constant(LONG, 1), self.lanes) << exponent
+
+    def _columns(self, table: Any, index: Vector, count: int) -> list[Vector]:
+        """Return the elements from each lane's index on, one vector for each place."""
+        whole = count - count % LANES if self.lanes == LANES else 0
+        columns = [v for k in range(0, whole, LANES) for v in gather_columns(self.builder, table, index + k)]
+        return columns + [gather(self.builder, table, index + k) for k in range(whole, count)]
 
     def record(self, index: Vector) -> list[Vector]:
-        return [
-            *gather_columns(self.builder, self.runs, index),
-            *gather_columns(self.builder, self.runs, index + LANES),
-        ]
+        return self._columns(self.runs, index, RUN_SIZE)
 
     def leaf(self, index: Vector) -> list[Vector]:
-        return [
-            *gather_columns(self.builder, self.ints, index),
-            *gather_columns(self.builder, self.ints, index + LANES),
-        ]
+        return self._columns(self.ints, index, LEAF_INT_SIZE)
 
     def axes(self, index: Vector) -> list[Vector]:
-        return gather_columns(self.builder, self.blob, index)
+        return self._columns(self.blob, index, LANES)
 
     def pair(self, index: Vector) -> list[Vector]:
         return gather_rows(self.builder, self.ints, index, 2)
@@ -72,8 +73,7 @@ class Emitted:
         return gather(self.builder, self.ints, index)
 
     def cell(self, index: Vector) -> list[Vector]:
-        numbers = [*gather_columns(self.builder, self.tab, index), gather(self.builder, self.tab, index + LANES)]
-        return [number.doubles() for number in numbers]
+        return [number.doubles() for number in self._columns(self.tab, index, CELL_SIZE)]
 
 
 class Counted:

@@ -4,11 +4,10 @@ import math
 
 import numpy as np
 
-from hhsr.kernels.cell_along import AGAIN, ASKED, EXCESS, EXCESS_STRAY, GIVEN, KNOWN, ONCE, RUN, SURE, settle_by_cells
+from hhsr.kernels.cell_along import AGAIN, ASKED, EXCESS, EXCESS_STRAY, GIVEN, KNOWN, ONCE, RUN, SURE, settle_by_cell
 from hhsr.kernels.chart_walk import follow_cells
 from hhsr.kernels.clipped import follow_tree, merge_touches
 from hhsr.kernels.lane import MERGE
-from hhsr.kernels.layout import LANES
 from hhsr.kernels.runs import (
     AFTER,
     BEFORE,
@@ -90,41 +89,36 @@ def settle_other(blob, ints, tab, runs, run, resolution, tolerance, gap, out, co
 
 
 @inlined
-def ask_cells(blob, ints, tab, runs, first, used, tolerance, rows):
-    """Ask the cells of the runs from `first` on, LANES at most of `used`: rows (CELL_ROWS, LANES), a lane each."""
-    for lane in range(LANES):
-        rows[RUN, lane] = min(first + lane, used - 1)
-    settle_by_cells(rows, runs, blob, ints, tab, tolerance)
-
-
-@inlined
-def _told(blob, ints, runs, run, rows, lane, tolerance):
+def _told(blob, ints, tab, runs, run, rows, tolerance):
     """Return what is known of a smooth run after its cell was asked; OPEN: another cell is to be."""
-    known = rows[KNOWN, lane]
-    take_over(runs, run, rows, lane)
+    rows[RUN, 0] = run
+    settle_by_cell(rows, runs, blob, ints, tab, tolerance)
+    known = rows[KNOWN, 0]
+    take_over(runs, run, rows, np.int64(0))
     if known == AGAIN:
         return OPEN
     verdict = CROSSED if known == SURE else CLEAR
     if known == ASKED:
-        verdict = part(runs, run, rows[EXCESS, lane], rows[EXCESS_STRAY, lane])
+        verdict = part(runs, run, rows[EXCESS, 0], rows[EXCESS_STRAY, 0])
     elif known == ONCE:
-        give(rows, lane, rows, np.int64(GIVEN))
+        give(rows, np.int64(0), rows, np.int64(GIVEN))
         verdict = ask_value(blob, runs, run, rows, np.int64(GIVEN), tolerance)
     return ask_formulas(blob, ints, runs, run, tolerance) if verdict == OPEN else verdict
 
 
 @unmanaged
 def settle_run(
-    blob, ints, tab, runs, run, spare, resolution, tolerance, gap, out, count, work, slots, pending, rows, lane, more
+    blob, ints, tab, runs, run, spare, resolution, tolerance, gap, out, count, work, slots, pending, rows
 ):  # fmt: skip
-    """Do what `settle_other` does for a run alone, of any kind, whose cell was asked in a lane of rows, if it has one.
+    """Do what `settle_other` does for a run alone, of any kind.
 
-    spare: from this record on HALVINGS are free, for halves that wait. more: (CELL_ROWS, LANES) scratch.
+    spare: from this record on HALVINGS are free, for halves that wait. rows: (CELL_ROWS, LANES) scratch.
     """
     if not is_smooth(runs, run):
         return settle_other(blob, ints, tab, runs, run, resolution, tolerance, gap, out, count, work, slots, pending)
-    waiting, verdict = np.int64(0), _told(blob, ints, runs, run, rows, lane, tolerance)
+    waiting = np.int64(0)
     while True:
+        verdict = _told(blob, ints, tab, runs, run, rows, tolerance)
         code = int(runs[run, CODE])
         if verdict == HALVED_IN or verdict == HALVED_OUT:
             halve(runs, run, spare + waiting, verdict == HALVED_IN)
@@ -139,5 +133,3 @@ def settle_run(
             waiting -= 1
             for k in range(RUN_SIZE):
                 runs[run, k] = runs[spare + waiting, k]
-        ask_cells(blob, ints, tab, runs, run, run + 1, tolerance, more)
-        verdict = _told(blob, ints, runs, run, more, np.int64(0), tolerance)

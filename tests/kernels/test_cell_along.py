@@ -54,45 +54,43 @@ def in_arrays(blob: np.ndarray, runs: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def emitted() -> tuple[Callable[..., None], object]:
-    """What is emitted, as a function of five tables and a tolerance; and what keeps it."""
-    double, long, single = ir.DoubleType(), ir.IntType(64), ir.FloatType()
-    kinds = [
-        double.as_pointer(),
-        double.as_pointer(),
-        double.as_pointer(),
-        long.as_pointer(),
-        single.as_pointer(),
-        double,
-    ]
+def emitted() -> tuple[dict[int, Callable[..., None]], object]:
+    """What is emitted for LANES and for one, as functions of five tables and a tolerance; and what keeps them."""
+    double, long, single = ir.DoubleType().as_pointer(), ir.IntType(64).as_pointer(), ir.FloatType().as_pointer()
+    kind = ir.FunctionType(ir.VoidType(), [double, double, double, long, single, ir.DoubleType()])
     module = ir.Module()
-    function = ir.Function(module, ir.FunctionType(ir.VoidType(), kinds), "settle")
-    builder = ir.IRBuilder(function.append_basic_block())
-    told.emit_settled(builder, *function.args)
-    builder.ret_void()
+    for lanes in (LANES, 1):
+        function = ir.Function(module, kind, f"settle{lanes}")
+        builder = ir.IRBuilder(function.append_basic_block())
+        told.emit_settled(builder, lanes, *function.args)
+        builder.ret_void()
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     machine = llvm.Target.from_default_triple().create_target_machine()
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(str(module)), machine)
     engine.finalize_object()
-    pointer = ctypes.c_void_p
-    call = ctypes.CFUNCTYPE(None, pointer, pointer, pointer, pointer, pointer, ctypes.c_double)
-    return call(engine.get_function_address("settle")), engine
+    call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 5, ctypes.c_double)
+    return {lanes: call(engine.get_function_address(f"settle{lanes}")) for lanes in (LANES, 1)}, engine
 
 
 def test_emitted_code_has_what_arrays_have(
-    blob: np.ndarray, runs: np.ndarray, emitted: tuple[Callable[..., None], object]
+    blob: np.ndarray, runs: np.ndarray, emitted: tuple[dict[int, Callable[..., None]], object]
 ) -> None:
-    expected, call = in_arrays(blob, runs), emitted[0]
+    """And in one lane the same bits as in LANES."""
+    expected, calls = in_arrays(blob, runs), emitted[0]
     ints, tab = integers(blob), tables(blob)
     for first in range(0, COUNT, LANES):
         rows = np.full((told.CELL_ROWS, LANES), np.nan)
         rows[told.RUN] = np.arange(first, first + LANES)
-        places = [table.ctypes.data for table in (rows, runs, blob, ints, tab)]
-        call(*places, TOLERANCE)
+        calls[LANES](*(table.ctypes.data for table in (rows, runs, blob, ints, tab)), TOLERANCE)
         own = expected[:, first : first + LANES]
         assert np.array_equal(rows[[told.KNOWN, told.NEW_CODE]], own[[told.KNOWN, told.NEW_CODE]])
         np.testing.assert_allclose(rows[told.AT : told.GIVEN], own[told.AT :], rtol=1e-9, atol=1e-9)
+        for lane in range(LANES):
+            alone = np.full((told.CELL_ROWS, LANES), np.nan)
+            alone[told.RUN, 0] = first + lane
+            calls[1](*(table.ctypes.data for table in (alone, runs, blob, ints, tab)), TOLERANCE)
+            assert np.array_equal(alone[: told.GIVEN, 0], rows[: told.GIVEN, lane], equal_nan=True)
 
 
 def test_what_cells_tell_of_a_run_holds_along_it(blob: np.ndarray, runs: np.ndarray) -> None:

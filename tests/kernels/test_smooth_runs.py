@@ -7,11 +7,12 @@ import pytest
 
 from hhsr.kernels import runs as at
 from hhsr.kernels import smooth_runs
-from hhsr.kernels.cell_along import BENDS, CELL_ROWS
+from hhsr.kernels.cell_along import BENDS, CELL_ROWS, KNOWN, settled
 from hhsr.kernels.crossing import scratch
+from hhsr.kernels.either_lanes import Counted
 from hhsr.kernels.lane import MERGE
 from hhsr.kernels.layout import LANES, OWNER_INTS, OWNER_RECORD, integers, tables
-from hhsr.kernels.settle_run import ask_cells, settle_run
+from hhsr.kernels.settle_run import settle_run
 from hhsr.kernels.stretch import excess, excess_along
 from tests.kernels.small_solids import arithmetic_of_c, solid  # noqa: F401
 
@@ -62,7 +63,7 @@ def test_runs_have_the_crossings_of_f_along_them(blob: np.ndarray) -> None:
     """By their cells, by the formulas, halved or followed through the chart: what F says at a thousand steps."""
     ints, tab, leaf = integers(blob), tables(blob), leaf_of(blob)
     work, slots, pending = scratch()
-    rows, more = np.zeros((2, CELL_ROWS, LANES))
+    rows = np.zeros((CELL_ROWS, LANES))
     runs = np.zeros((at.HALVINGS + 1, at.RUN_SIZE))
     rng, out = np.random.default_rng(2), np.empty(64)
     seen: dict[int, int] = {}
@@ -70,15 +71,15 @@ def test_runs_have_the_crossings_of_f_along_them(blob: np.ndarray) -> None:
     for _ in range(COUNT):
         p, d, begin, end = grazing(blob, rng)
         put_run(blob, runs, 0, p, d, begin, end)
-        ask_cells(blob, ints, tab, runs, 0, 1, 0.001, rows)
-        runs[0, at.BEND_ALONG] = rows[BENDS, 0]
+        with np.errstate(all="ignore"):
+            told = settled(Counted(runs, blob, ints, tab), np.zeros(1), 0.001)
+        runs[0, at.BEND_ALONG] = told[BENDS - KNOWN][0]
         f, slope = excess_along(blob, ints, leaf, *(p + 0.5 * (begin + end) * d), *d)
         verdict = int(smooth_runs._prove(runs, 0, f, slope))
         seen[verdict] = seen.get(verdict, 0) + 1
         put_run(blob, runs, 0, p, d, begin, end)
-        ask_cells(blob, ints, tab, runs, 0, 1, 0.001, rows)
         count = settle_run(
-            blob, ints, tab, runs, 0, 1, 0.01, 0.001, runs[0, at.RUN_GAP], out, 0, work, slots, pending, rows, 0, more
+            blob, ints, tab, runs, 0, 1, 0.01, 0.001, runs[0, at.RUN_GAP], out, 0, work, slots, pending, rows
         )
         t = np.linspace(begin, end, 1001)
         values = np.array([excess(blob, ints, leaf, *(p + s * d)) for s in t])
