@@ -164,8 +164,8 @@ def settled(on: Any, number: Any, tolerance: Any) -> list[Any]:
 
     # In the middle of one leaf's run: it is clear, or monotone, or neither is proven.
     once, excess_stray, rise_stray, beyond = _strays(on, line, on.number(0.0))
-    known = beyond <= half * INSIDE
-    excess_stray, rise_stray = on.where(known, excess_stray, np.inf), on.where(known, rise_stray, np.inf)
+    over = beyond <= half * INSIDE
+    excess_stray, rise_stray = on.where(over, excess_stray, np.inf), on.where(over, rise_stray, np.inf)
     excess = g0 * once
     rise = (g1 - excess * dm) * once
     least = abs(rise) - rise_stray - bend * reach

@@ -121,8 +121,8 @@ def settle_smooth(blob, ints, tab, runs, used, order, smooth, later, given, tole
     """Settle the smooth runs, the first of the order, in rounds: halves of one are runs of the next.
 
     found: (k,) with room for all their crossings. Those that cannot be settled so are put behind the order's others;
-    returns where these end, and how many slots of found are used. later: (4, most), given: (most, LANES) scratch
-    (`most_runs`).
+    returns where these end, and how many slots of found are used. later: (4, most + 1), given: (most + 1, LANES)
+    scratch (`most_runs`): the runs of this round and of the next, those of which a value is asked, and a slope too.
     """
     place, lost, todo, others = np.int64(0), np.int64(used) - smooth, smooth, order[smooth:]
     now, then, exact, hard = later[0], later[1], later[2], later[3]

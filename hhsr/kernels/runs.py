@@ -24,7 +24,7 @@ NONE, MONOTONE, OWN, CLIPPED, POINT = 0, 1, 2, 3, 4
 CODE, RUN_BEGIN, RUN_END, GUESS, LEAST, MOST, RUN_BEND, RUN_GAP, LEAF = 0, 1, 2, 3, 4, 5, 6, 7, 8
 RUN_FROM, RUN_TO, NEXT, RUN_SIZE = 9, 12, 15, 16
 BEND_ALONG = MOST  # of a smooth run, whose bend is known, another bound of |d²F/dt²|
-OWNER = LEAF
+OWNER = LEAF  # while it is pending
 BEFORE, AFTER, RISES, TURNED = 8, 16, 32, 64  # in the code
 # Of settled runs a short record, for they are put together one segment after another: the place of its crossings, how
 # many there are (−1: too many), the number of the segment's next run.

@@ -48,7 +48,7 @@ from hhsr.kernels.unmanaged import inlined, unmanaged
 
 @inlined
 def _follow(blob, ints, tab, runs, run, resolution, tolerance, gap, out, count, work):
-    """Add the crossings of one leaf's run that is ready, by the leaf's cells; return how many there are then."""
+    """Add the crossings of one leaf's run, by the leaf's cells; return how many there are then."""
     code, end = int(runs[run, CODE]), runs[run, RUN_END]
     dx, dy, dz = runs[run, RUN_TO], runs[run, RUN_TO + 1], runs[run, RUN_TO + 2]
     state, count = follow_cells(

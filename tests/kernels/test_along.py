@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 
-import llvmlite.binding as llvm
 import numpy as np
 import pytest
 from llvmlite import ir
@@ -12,6 +11,7 @@ from llvmlite import ir
 from hhsr.kernels.along import emit_field, excess_of, ray_along
 from hhsr.kernels.sphere_rbf import scale_on_sphere
 from hhsr.kernels.vectors import LANES
+from tests.kernels.emitted import engine_of
 
 FIELD, CHANGE, ALONE, SIZE = 6, 7, 8, 9  # of the functions' numbers: a direction, a way, and what is filled in
 
@@ -31,11 +31,7 @@ def call() -> tuple[object, object]:
     for k, total in enumerate(sums):
         builder.store(total, builder.gep(numbers, [ir.Constant(long, FIELD + k)]))
     builder.ret_void()
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    machine = llvm.Target.from_default_triple().create_target_machine()
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(str(module)), machine)
-    engine.finalize_object()
+    engine = engine_of(module)
     kind = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
     return kind(engine.get_function_address("field")), engine
 

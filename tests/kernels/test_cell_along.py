@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 
-import llvmlite.binding as llvm
 import numpy as np
 import pytest
 from llvmlite import ir
@@ -16,6 +15,7 @@ from hhsr.kernels.either_lanes import Counted
 from hhsr.kernels.lane import MERGE
 from hhsr.kernels.layout import LANES, integers, tables
 from hhsr.kernels.stretch import excess_along
+from tests.kernels.emitted import engine_of
 from tests.kernels.small_solids import arithmetic_of_c, solid  # noqa: F401
 from tests.kernels.test_smooth_runs import grazing, leaf_of, put_run
 
@@ -64,11 +64,7 @@ def emitted() -> tuple[dict[int, Callable[..., None]], object]:
         builder = ir.IRBuilder(function.append_basic_block())
         told.emit_settled(builder, lanes, *function.args)
         builder.ret_void()
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    machine = llvm.Target.from_default_triple().create_target_machine()
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(str(module)), machine)
-    engine.finalize_object()
+    engine = engine_of(module)
     call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 5, ctypes.c_double)
     return {lanes: call(engine.get_function_address(f"settle{lanes}")) for lanes in (LANES, 1)}, engine
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import math
 
-import llvmlite.binding as llvm
 import numpy as np
 import pytest
 from llvmlite import ir
@@ -14,6 +13,7 @@ from hhsr.kernels import lane as at
 from hhsr.kernels.stride import emit_stride
 from hhsr.kernels.surfel import FINE
 from hhsr.kernels.voxels import BRICK_SIZE, NO_SURFEL, leap_of, state_of, step_of
+from tests.kernels.emitted import engine_of
 
 SHAPE = (3, 4, 5)  # bricks
 SLOTS, SURFELS = 40, 90
@@ -144,11 +144,7 @@ def stride() -> object:
     function = ir.Function(module, kind, "stride")
     builder = ir.IRBuilder(function.append_basic_block())
     builder.ret(emit_stride(builder, *function.args[:3], function.args[3:]))
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    machine = llvm.Target.from_default_triple().create_target_machine()
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(str(module)), machine)
-    engine.finalize_object()
+    engine = engine_of(module)
     call = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * 3, *[ctypes.c_int64] * 7)(
         engine.get_function_address("stride")
     )
