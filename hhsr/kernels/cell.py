@@ -7,6 +7,7 @@ stay straight and the surface is a height field (DESIGN §4).
 
 import math
 
+from hhsr.kernels.field_sums import field_at
 from hhsr.kernels.interval import product, widened
 from hhsr.kernels.layout import (
     AZIMUTH,
@@ -22,13 +23,12 @@ from hhsr.kernels.layout import (
 from hhsr.kernels.leaf import MAX_SCALE
 from hhsr.kernels.norm_bounds import norm_range
 from hhsr.kernels.scale_range import scale_range
-from hhsr.kernels.sphere_rbf import gaussian_sum
 from hhsr.kernels.superquadric import superquadric_norm
 from hhsr.kernels.third import third_over
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import inlined, unmanaged
 
 
-@unmanaged
+@inlined
 def face_of(x, y, z):
     """Return (face, a, b, m) of a point that is not the centre: face 2k for the positive major axis k, 2k + 1 else."""
     ux, uy, uz = abs(x), abs(y), abs(z)
@@ -39,7 +39,7 @@ def face_of(x, y, z):
     return (4 if z >= 0.0 else 5), x / uz, y / uz, uz
 
 
-@unmanaged
+@inlined
 def direction_of(face, a, b):
     """Return the direction (x, y, z), of |·|∞ = 1, that belongs to (a, b) on a face."""
     m = 1.0 if face % 2 == 0 else -1.0
@@ -82,16 +82,18 @@ def block_of(face, a, b):
     return (face * BLOCKS_PER_SIDE + i) * BLOCKS_PER_SIDE + j
 
 
-@unmanaged
+@inlined
+def centres_of(ints, leaf, block):
+    """Return (float slot, count) of the centres of a block of directions."""
+    start = ints[leaf + BLOCKS] + block
+    return ints[leaf + BLOCK_DATA] + ints[start], (ints[start + 1] - ints[start]) // BLOCK_ROWS
+
+
+@inlined
 def scale_in_block(blob, ints, leaf, block, ux, uy, uz):
     """Return s(u), summed over the centres of the block."""
-    start = ints[leaf + BLOCKS] + block
-    o = ints[leaf + BLOCK_DATA] + ints[start]
-    n = (ints[start + 1] - ints[start]) // BLOCK_ROWS
-    return gaussian_sum(
-        blob[o : o + n], blob[o + n : o + 2 * n], blob[o + 2 * n : o + 3 * n], blob[o + 3 * n : o + 4 * n],
-        blob[o + 4 * n : o + 5 * n], ux, uy, uz,
-    )  # fmt: skip
+    o, n = centres_of(ints, leaf, block)
+    return field_at(blob, o, n, (ux, uy, uz))
 
 
 @unmanaged

@@ -17,7 +17,6 @@ import numpy as np
 from numba import config, types
 from numba.extending import intrinsic
 
-from hhsr.kernels.either_lanes import Counted, Emitted
 from hhsr.kernels.lane import MERGE
 from hhsr.kernels.layout import (
     BEND_AA,
@@ -62,6 +61,7 @@ from hhsr.kernels.runs import (
     RUN_TO,
     TURNED,
 )
+from hhsr.kernels.table_lanes import CountedTables, EmittedTables
 from hhsr.kernels.vectors import Vector, load, store
 
 # Rows of LANES numbers each: of the run its number; then what is known of it (below), the code, guess, least |dF/dt|
@@ -293,7 +293,7 @@ def emit_settled(
     builder: Any, lanes: int, rows: Any, runs: Any, blob: Any, ints: Any, tab: Any, tolerance: Any
 ) -> None:
     """Emit rows KNOWN … COUNT of the runs whose numbers are in row RUN, in the first lanes."""
-    on = Emitted(builder, lanes, runs, blob, ints, tab)
+    on = EmittedTables(builder, lanes, runs, blob, ints, tab)
     numbers = load(builder, rows, RUN * LANES, lanes)
     for k, row in enumerate(settled(on, numbers, Vector.of(builder, tolerance, lanes))):
         store(builder, row, rows, (KNOWN + k) * LANES)
@@ -304,7 +304,7 @@ if config.DISABLE_JIT:  # type: ignore[attr-defined]
     def settle_by_cells(rows: Any, runs: Any, blob: Any, ints: Any, tab: Any, tolerance: float) -> None:
         """Fill rows KNOWN … COUNT: as compiled, but for the last bits."""
         with np.errstate(all="ignore"):
-            rows[KNOWN:GIVEN] = settled(Counted(runs, blob, ints, tab), rows[RUN], tolerance)
+            rows[KNOWN:GIVEN] = settled(CountedTables(runs, blob, ints, tab), rows[RUN], tolerance)
 
     def settle_by_cell(rows: Any, runs: Any, blob: Any, ints: Any, tab: Any, tolerance: float) -> None:
         """Do so for the first lane."""

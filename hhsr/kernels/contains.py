@@ -7,6 +7,7 @@ from numba import njit
 
 from hhsr.kernels.layout import VOXELS, integers, tables
 from hhsr.kernels.tree import contains_point, into_tree
+from hhsr.kernels.unmanaged import entry
 from hhsr.kernels.voxels import voxel_state
 
 INSIDE, OUTSIDE, INVALID = 1, 0, -1
@@ -25,7 +26,7 @@ def contains_one(blob, x, y, z):
     return INSIDE if state > 0 else OUTSIDE
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def contains_many(blob, points, out):
     """Fill (n,) int8 with 1 inside, 0 outside, −1 not finite; return how many are not finite."""
     ints, tab = integers(blob), tables(blob)

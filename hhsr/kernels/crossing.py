@@ -16,7 +16,7 @@ from hhsr.kernels.runs import HALVINGS, RUN_SIZE
 from hhsr.kernels.segment import PIECES, emit
 from hhsr.kernels.settle_run import settle_run
 from hhsr.kernels.tree import into_tree
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import entry, unmanaged
 from hhsr.kernels.vectors import LANES
 from hhsr.kernels.voxels import solid_contains
 from hhsr.kernels.walk import go_on
@@ -139,7 +139,7 @@ def first_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance):
     return t[0] if count > 0 else np.nan
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def first_exits(blob, root, centre, rays, resolution, tolerance, out):
     """Fill (n,) share of the first exit of rays (n, 3) from a centre (3,), tree frame, out of the solid of node `root`.
 

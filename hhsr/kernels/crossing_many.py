@@ -9,7 +9,7 @@ centres.
 import math
 
 import numpy as np
-from numba import config, njit
+from numba import config
 
 from hhsr.kernels.cell_along import CELL_ROWS
 from hhsr.kernels.crossing import scratch
@@ -44,7 +44,7 @@ from hhsr.kernels.run_batch import (
 from hhsr.kernels.runs import ANSWER_PLACE, ANSWER_SIZE, RUN_SIZE
 from hhsr.kernels.stride import stride
 from hhsr.kernels.tree import into_tree
-from hhsr.kernels.unmanaged import inlined, unmanaged
+from hhsr.kernels.unmanaged import entry, inlined, unmanaged
 from hhsr.kernels.vectors import LANES, ask_ahead, bits_set, lowest_bit
 from hhsr.kernels.voxels import BRICKS, DETAILS, PLANES, VOXELS_AT, solid_contains
 from hhsr.kernels.walk import SPARE, cross_voxel, go_on
@@ -163,7 +163,7 @@ def _ask_for_answer(k, size, row, order, firsts, answers, found, counts, begins,
             ask_ahead(found, np.int64(answers[firsts[k], ANSWER_PLACE]))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def _longer(table):
     """Return a table with as much room again, and more, behind its rows."""
     out = np.empty((2 * table.shape[0] + LANES * ROOM, *table.shape[1:]))
@@ -171,7 +171,7 @@ def _longer(table):
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def cross_many(blob, starts, ends, order, first, resolution, tolerance, counts, begins, places, base):
     """Follow the rows `order` of LPS segments (n, 3) → (n, 3), in that order.
 

@@ -1,9 +1,8 @@
 """Where the crossings of a batch go: from the order that its segments were followed in to that of the answers."""
 
 import numpy as np
-from numba import njit
 
-from hhsr.kernels.unmanaged import inlined
+from hhsr.kernels.unmanaged import entry, inlined
 from hhsr.kernels.vectors import ask_ahead
 
 AHEAD = 8  # rows whose crossings are asked for before they are placed
@@ -15,7 +14,7 @@ def _place(places, bases, row):
     return bases[places[row] >> PART_SHIFT] + (places[row] & ((1 << PART_SHIFT) - 1))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def place_first(counts, places, bases, ts, out):
     """Fill out (n,) with the first crossings that `cross_many` told of: NaN none, −1 not finite; how many are not.
 
@@ -28,7 +27,7 @@ def place_first(counts, places, bases, ts, out):
     return bad
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def place_counts(counts, valid, offsets):
     """Fill valid (n,), whether a segment is finite, and offsets (n + 1,), where each one's crossings begin."""
     offsets[0] = 0
@@ -36,7 +35,7 @@ def place_counts(counts, valid, offsets):
         valid[i], offsets[i + 1] = counts[i] >= 0, offsets[i] + max(counts[i], 0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def place_all(starts, ends, first, stop, begins, places, bases, ts, offsets, t, points, entering):
     """Fill t (m,), points (m, 3) and entering (m,) with the crossings of segments first … stop of (n, 3) → (n, 3).
 

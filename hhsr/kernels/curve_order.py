@@ -5,6 +5,8 @@ import math
 import numpy as np
 from numba import njit
 
+from hhsr.kernels.unmanaged import entry
+
 SIDE = 32
 SAMPLE = 16  # the box is that of every so many-th row: others beyond it go to its outermost cells
 CELLS = SIDE**3
@@ -23,7 +25,7 @@ def _cell(x):
     return int(min(max(x, 0.0), SIDE - 1.0))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def order_along_curve(points, others, keys, order):
     """Fill order (n,) with the rows of points (n, 3) + others (n, 3): cell after cell of their box, as they came in.
 

@@ -1,15 +1,14 @@
 """The order in which facets stand under their discs: sixteen neighbours in each, whichever leaf or face they are of."""
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.disc_bounds import WIDE
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import entry, unmanaged
 
 DEEP = 128  # pending ranges: two a halving would do
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def order_facets(points, order):
     """Sort points (m, 3) in place so that runs of 16, 256, 4096 … lie close together; order: (m,) their old rows.
 

@@ -9,11 +9,10 @@ float32, rounded outward, in the tree's frame.
 import math
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.disc_bounds import WIDE
 from hhsr.kernels.facets import RADIUS, THICK
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import entry, unmanaged
 
 TOP = 2  # blocks of the highest level
 STEPS = 8  # of a disc's centre towards the farthest of its facets
@@ -62,7 +61,7 @@ def _centre_disc(facets, first, last, nx, ny, nz, disc):
     disc[0], disc[1], disc[2] = cx, cy, cz
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def fill_discs(facets, sizes, blocks):
     """Fill the blocks (Σ ⌈size/16⌉, DISC_SIZE, 16) float32, lowest level first, from the facets' discs (m, 8)."""
     start, span = 0, 1

@@ -55,7 +55,7 @@ from hhsr.kernels.tree import (
     into_tree,
     out_of_tree,
 )
-from hhsr.kernels.unmanaged import managed, unmanaged
+from hhsr.kernels.unmanaged import entry, managed, unmanaged
 from hhsr.kernels.voxels import settled_about, solid_contains
 
 ASIDE = 1e-6  # mm: how far off a plane its two sides are asked
@@ -192,7 +192,7 @@ def distance_one(blob, x, y, z, tolerance):
     return _signed_distance(blob, ints, tab, x, y, z, tolerance, search, local, nodes, keys, corners, spare, rects)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def nearest_many(blob, points, order, tolerance, distance, foot):
     """Fill (n,) signed distance (mm) and (n, 3) nearest surface point of LPS points (m, 3); NaN where not finite.
 

@@ -7,7 +7,6 @@ hierarchy of `hhsr.kernels.discs`, in the order of `hhsr.kernels.disc_order`: no
 import math
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.cell import cell_model
 from hhsr.kernels.layout import (
@@ -37,7 +36,7 @@ from hhsr.kernels.maps import (
     ray_thickness,
 )
 from hhsr.kernels.polygon import ROOM, clip_polygon
-from hhsr.kernels.unmanaged import inlined, unmanaged
+from hhsr.kernels.unmanaged import entry, inlined, unmanaged
 
 THICK, RADIUS = 6, 7  # of a facet's disc (`hhsr.kernels.discs`)
 
@@ -75,7 +74,7 @@ def _put_disc(disc, frame, cx, cy, cz, nx, ny, nz, thick, radius):
     disc[THICK], disc[RADIUS] = thick, radius
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def list_facets(blob, owner, leaf, planes, count, codes, discs):
     """Fill codes (m,) and discs (m, 8) of the facets of a leaf; return how many. Call with m the number of its cells.
 

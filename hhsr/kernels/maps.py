@@ -32,7 +32,7 @@ from hhsr.kernels.layout import (
     VALUE,
     integers,
 )
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import entry, inlined, unmanaged
 
 UP = 1.0 + 3e-7  # more than one float32 rounding
 MOST_CELLS = 500  # that one square of directions may meet
@@ -62,7 +62,7 @@ def index_of(x, side):
     return min(max(int((x + 1.0) * 0.5 * side), 0), side - 1)
 
 
-@unmanaged
+@inlined
 def cell_at(ints, leaf, face, a, b):
     """Return (slot, a, b, half) of the cell that holds (a, b): its float32 slot, its centre and half its side."""
     n = ints[leaf + CELLS]
@@ -76,7 +76,7 @@ def cell_at(ints, leaf, face, a, b):
     return slot, (2 * (i * s + p) + 1) * half - 1.0, (2 * (j * s + q) + 1) * half - 1.0, half
 
 
-@unmanaged
+@inlined
 def jet_of(tab, o, half):
     """Return (W, W_a, W_b, W_aa, W_ab, W_bb) at the middle of the cell at a float32 slot, to 2e-7·W; NaN: unknown."""
     aa, ab, bb = np.float64(tab[o + BEND_AA]), np.float64(tab[o + BEND_AB]), np.float64(tab[o + BEND_BB])
@@ -84,7 +84,7 @@ def jet_of(tab, o, half):
     return w, np.float64(tab[o + SLOPE_A]), np.float64(tab[o + SLOPE_B]), aa, ab, bb
 
 
-@unmanaged
+@inlined
 def jet_near(tab, ints, leaf, face, a, b):
     """Return (W, W_a, W_b, W_aa, W_ab, W_bb, error) at (a, b) by the table, the error a bound of W's; NaN: unknown."""
     o, ca, cb, half = cell_at(ints, leaf, face, a, b)
@@ -255,7 +255,7 @@ def _put_bend(bends, face, i, j, bend_lo, bend_hi):
     bends[face, i, j, 0], bends[face, i, j, 1] = bend_lo - 3e-7 * abs(bend_lo), bend_hi + 3e-7 * abs(bend_hi)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def prove_base(blob, leaf, n, planes, count, models, spans, thickness, bends):
     """Prove the base cells of a leaf.
 
@@ -296,7 +296,7 @@ def prove_base(blob, leaf, n, planes, count, models, spans, thickness, bends):
                 thickness[face, i, j] = worst
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def prove_cells(blob, leaf, n, parting, models, spans, cells, bends):
     """Prove the cells of every parted base cell, and narrow its span by theirs.
 
@@ -332,7 +332,7 @@ def prove_cells(blob, leaf, n, parting, models, spans, cells, bends):
                 )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def fill_ranges(n, spans, ranges, box):
     """Fill the pyramid of ranges (nodes, 2) float32 from the spans of the base cells, and the leaf's box.
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from hhsr.kernels.cell import direction_of
 from hhsr.kernels.patch import LENGTH2, START, VECTOR
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import inlined, unmanaged
 
 
 @unmanaged
@@ -29,7 +29,7 @@ def _along_edge(c, linear, square, half):
     return c + (linear + square * x) * x, x
 
 
-@unmanaged
+@inlined
 def least_over_square(c, ca, cb, aa, ab, bb, half):
     """Return (least, a, b) of c + ca·a + cb·b + aa·a² + 2·ab·a·b + bb·b² over |a|, |b| ≤ half."""
     det = aa * bb - ab * ab
@@ -51,7 +51,7 @@ def least_over_square(c, ca, cb, aa, ab, bb, half):
     return least, where_a, where_b
 
 
-@unmanaged
+@inlined
 def bounding_quadratic(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third):
     """Return (c, ca, cb, aa, ab, bb, slack) of a quadratic of δ: where it is > slack over the square about (a, b), no
     surface over it lies within `radius` of the search's segment. Slack is infinite where W may vanish on the square.
@@ -110,7 +110,7 @@ def bounding_quadratic(search, radius, face, a, b, half, w, wa, wb, waa, wab, wb
     )  # fmt: skip
 
 
-@unmanaged
+@inlined
 def square_is_clear(search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third):
     """Return (clear, δa, δb): no surface over the square about (a, b) lies within `radius` of the search's segment.
 

@@ -19,6 +19,7 @@ from hhsr.kernels.layout import (
 from hhsr.kernels.maps import cell_corners, cell_sphere, outside_region, quad_radius_ok, ray_thickness
 from hhsr.kernels.part import TRIANGLES, part_arrays
 from hhsr.kernels.polygon import ROOM, clip_polygon
+from hhsr.kernels.unmanaged import entry
 
 
 @njit(cache=True, error_model="numpy")
@@ -41,7 +42,7 @@ def _add_steep(blob, ints, leaf, planes, count, face, a, b, half, rotation, box)
                 _add(box, rotation, x, y, z, radius)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def leaf_box(blob, leaf, planes, count, rotation, box):
     """Fill (6,) lowest and highest corner of R·(surface of a model leaf within its region); lowest > highest: empty."""
     ints, tab = integers(blob), tables(blob)
@@ -72,7 +73,7 @@ def leaf_box(blob, leaf, planes, count, rotation, box):
                 _add(box, rotation, corners[k, 0], corners[k, 1], corners[k, 2], thick)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def part_box(blob, part, planes, count, rotation, box):
     """Fill (6,) the same of a retained part's triangles within its region."""
     ints = integers(blob)

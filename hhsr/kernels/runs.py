@@ -11,7 +11,7 @@ import numpy as np
 from hhsr.kernels.lane import END, FIRST_RUN, FOUND, GAP, LAST_RUN, RUNS_USED, SPILLED, START
 from hhsr.kernels.layout import FRAME, OWNER_INT_SIZE, OWNER_INTS, OWNER_RECORD, ROTATED
 from hhsr.kernels.tree import into_leaf, turn_into_leaf
-from hhsr.kernels.unmanaged import inlined, unmanaged
+from hhsr.kernels.unmanaged import inlined
 from hhsr.kernels.vectors import ask_ahead
 
 # Kinds of runs: none; F is proven monotone; one leaf's; anybody's; no stretch, but a change at one place.
@@ -82,7 +82,7 @@ def close(blob, ints, kind, runs, lanes, lane, state, new, end, surfel):
         lanes[FOUND, lane] = min(lanes[FOUND, lane], end)
 
 
-@unmanaged
+@inlined
 def _complete(blob, ints, runs, run, lanes, lane, key):
     """Fill in what a closed run says of its lane's segment: where it lies, in its leaf's frame if it is one leaf's."""
     kind = int(runs[run, CODE]) & 7

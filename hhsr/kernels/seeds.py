@@ -4,13 +4,12 @@ Nothing is proven by it: a good beginning only makes a search short.
 """
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.layout import SEED_CELLS, SEED_FRAME, SEEDS
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import entry, inlined, unmanaged
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def fill_seeds(centres, low, side, out):
     """Fill (nx, ny, nz) int32 with the index of a facet (its centre: (m, 3)) near each cell's centre.
 
@@ -58,7 +57,7 @@ def _away2(centres, q, low, side, i, j, k):
     return (centres[q, 0] - x) ** 2 + (centres[q, 1] - y) ** 2 + (centres[q, 2] - z) ** 2
 
 
-@unmanaged
+@inlined
 def seed_at(blob, ints, x, y, z):
     """Return the facet named by the cell that holds a point of the tree's frame, or by the cell nearest to it."""
     c, f = ints[SEED_CELLS], ints[SEED_FRAME]

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.interval import SLACK, product, signed
 from hhsr.kernels.norm_bounds import norm_range
@@ -21,7 +20,7 @@ from hhsr.kernels.slab import (
     TABLE,
     lobe_contour,
 )
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import entry, unmanaged
 
 STEP = 2.0 * math.pi / TABLE
 MAX_SCALE = 0.95
@@ -162,7 +161,7 @@ def lobe_range(blob, ints, lobe, angle0, angle1, t0, t1):
     return lo, hi
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def fill_lobe_spheres(blob, ints, slab, lobe, spheres):
     """Fill (TABLE, 6): sphere of each segment's strip (tree frame) 4, least and greatest r."""
     f = ints[slab + SLAB_FRAME]

@@ -6,8 +6,8 @@ The value and the slope, and the place of a crossing, are those of the cell's qu
 bounded; where that is not enough, the formula's.
 """
 
-from hhsr.kernels.along import field_at
 from hhsr.kernels.cell_along import AT, BENDS, COUNT, FIRST, NEW_CODE, NORM, RISE, RISE_STRAY, STEEP, UNIT
+from hhsr.kernels.field_sums import field_at
 from hhsr.kernels.lane import MERGE
 from hhsr.kernels.layout import LANES
 from hhsr.kernels.runs import (

@@ -6,9 +6,10 @@ more than B·Δ²/2.
 
 import math
 
-from hhsr.kernels.along import excess_of, field_along, ray_along
-from hhsr.kernels.cell import block_of, face_of, norm_at, scale_in_block
-from hhsr.kernels.layout import BLOCK_DATA, BLOCK_ROWS, BLOCKS, HALF_AXES
+from hhsr.kernels.along import excess_of, ray_along
+from hhsr.kernels.cell import block_of, centres_of, face_of, norm_at, scale_in_block
+from hhsr.kernels.field_sums import field_along
+from hhsr.kernels.layout import HALF_AXES
 from hhsr.kernels.leaf import MAX_SCALE
 from hhsr.kernels.unmanaged import inlined, unmanaged
 
@@ -37,13 +38,6 @@ def excess(blob, ints, leaf, x, y, z):
     face, a, b, _ = face_of(x, y, z)
     s = scale_in_block(blob, ints, leaf, block_of(face, a, b), x / length, y / length, z / length)
     return norm_at(blob, ints, leaf, x, y, z) / (1.0 - min(s, MAX_SCALE)) - 1.0
-
-
-@inlined
-def centres_of(ints, leaf, block):
-    """Return (float slot, count) of the centres of a block of directions."""
-    start = ints[leaf + BLOCKS] + block
-    return ints[leaf + BLOCK_DATA] + ints[start], (ints[start + 1] - ints[start]) // BLOCK_ROWS
 
 
 @inlined

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.cell import face_of, leaf_implicit
 from hhsr.kernels.layout import (
@@ -30,7 +29,7 @@ from hhsr.kernels.layout import (
 from hhsr.kernels.maps import cell_at
 from hhsr.kernels.part import part_contains, part_field
 from hhsr.kernels.slab import slab_contains, slab_field
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import entry, unmanaged
 
 
 @unmanaged
@@ -148,7 +147,7 @@ def field_point(blob, ints, x, y, z):
     return slab_field(blob, ints, record, x, y, z)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def field_many(blob, points, out):
     """Fill (n,) implicit values of LPS points; NaN where not finite; return how many are not."""
     ints = integers(blob)

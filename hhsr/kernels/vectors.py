@@ -6,6 +6,7 @@ all lanes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from llvmlite import ir
@@ -164,6 +165,31 @@ def root(number: Vector) -> Vector:
         number.builder,
         number.builder.call(_intrinsic(number.builder, f"llvm.sqrt.{_name(number)}", kind, [kind]), [number.value]),
     )
+
+
+def totals(numbers: Sequence[Vector]) -> list[Any]:
+    """Return the sum of all lanes of each of some vectors of doubles, no more than they have lanes.
+
+    Lanes are halved two vectors at a time, so that in the end all sums stand in one.
+    """
+    builder, width = numbers[0].builder, numbers[0].lanes
+    rows, owners = [number.value for number in numbers], [[k] for k in range(len(numbers))]
+    while width > 1:
+        width //= 2
+        if len(rows) > 1 and len(rows) % 2 == 1:
+            rows, owners = [*rows, rows[-1]], [*owners, [-1] * len(owners[-1])]
+        sides, lanes = min(len(rows), 2), rows[0].type.count
+        parts = [(part, side) for part in range(lanes // (2 * width)) for side in range(sides)]
+        lower = [side * lanes + 2 * width * part + lane for part, side in parts for lane in range(width)]
+        halves = [ir.Constant(_wide(INT, len(lower)), [lane + upper for lane in lower]) for upper in (0, width)]
+        pairs = range(0, len(rows), sides)
+        owners = [[owners[k + side][part] for part, side in parts] for k in pairs]
+        rows = [
+            builder.fadd(*(builder.shuffle_vector(rows[k], rows[k + sides - 1], half) for half in halves))
+            for k in pairs
+        ]
+    places = [owners[0].index(k) for k in range(len(numbers))]
+    return [builder.extract_element(rows[0], ir.Constant(INT, place)) for place in places]
 
 
 def _name(numbers: Vector) -> str:

@@ -10,7 +10,6 @@ and what it asks of a voxel, lies in one place each.
 import math
 
 import numpy as np
-from numba import njit
 
 from hhsr.kernels.box_state import IN, MIXED, OUT, box_state
 from hhsr.kernels.layout import NODE_FLOAT_SIZE, NODE_FLOATS, VOXEL_FRAME, VOXELS, integers, tables
@@ -28,7 +27,7 @@ from hhsr.kernels.surfel import (
 )
 from hhsr.kernels.tree import contains_point
 from hhsr.kernels.triangle_build import STACK
-from hhsr.kernels.unmanaged import inlined, unmanaged
+from hhsr.kernels.unmanaged import entry, inlined, unmanaged
 
 BRICK = 4  # voxels a side
 COARSE = 8  # bricks a side of the first cubes that are tried
@@ -48,7 +47,7 @@ SHORT_BITS, STEP_BITS, FARTHEST_STEP = 8, 3, 7
 LONGEST = 127  # bricks
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def fill_bricks(blob, low, side, first, last, out):
     """Fill (nx, ny, nz) int8 of the bricks (cubes of `side`) of x in first … last: 1 inside, −1 outside, 0 neither."""
     ints, tab = integers(blob), tables(blob)
@@ -95,7 +94,7 @@ def _prove_brick(blob, ints, tab, low, side, brick, q, e, acc, plane, out, left,
         out[OFFSET] = -SURE if state == IN else SURE
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def fill_voxels(blob, low, side, bricks, voxels, bases, planes, surfels, extras):
     """Prove the voxels, of side `side`, of bricks (n, 3) one by one; return how many surfels and extras there are.
 
@@ -142,7 +141,7 @@ def fill_voxels(blob, low, side, bricks, voxels, bases, planes, surfels, extras)
     return used, extra
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def fill_octant(states, octant, out):
     """Fill (nx, ny, nz) int8 leaps of one octant: ± the side, in bricks, of the greatest cube of one state.
 
@@ -205,7 +204,7 @@ def leap_of(words, brick, octant):
     return leap if leap < 128 else leap - 256
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def state_voxels(bricks, voxels, out):
     """Fill out (4·nx, 4·ny, 4·nz) int8 of bricks (nx, ny, nz) int8: 1 inside, −1 outside, 0 neither.
 
@@ -223,7 +222,7 @@ def state_voxels(bricks, voxels, out):
                     out[BRICK * bi + (v >> 4), BRICK * bj + ((v >> 2) & 3), BRICK * bk + (v & 3)] = state
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def fill_steps(bricks, leaps, out):
     """Fill out (n, 64) int8 with the leaps (4·nx, 4·ny, 4·nz) int8 of one octant, less 1, by voxel."""
     slot = 0

@@ -39,7 +39,7 @@ from hhsr.kernels.layout import NODE_FLOAT_SIZE, NODE_FLOATS, OWNER_INT_SIZE, OW
 from hhsr.kernels.runs import MONOTONE, NONE, OWN, OWNER, RUN_BEGIN, close, enter, note
 from hhsr.kernels.surfel import BEND, DETAIL_SIZE, EXTRA, PLANE_SIZE, SURFEL_OWNER, THICK, TURN
 from hhsr.kernels.tree import into_leaf
-from hhsr.kernels.unmanaged import inlined, unmanaged
+from hhsr.kernels.unmanaged import inlined
 from hhsr.kernels.voxels import (
     BRICK,
     BRICK_SIZE,
@@ -62,7 +62,7 @@ SPARE = 8  # records that are left when a walk alone waits for its runs to be se
 UNKNOWN = 2
 
 
-@unmanaged
+@inlined
 def _holds(blob, ints, owner, x, y, z):
     """Return whether a model leaf holds a point of the tree's frame, by the exact formula."""
     leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * owner + OWNER_RECORD]

@@ -11,10 +11,10 @@ from llvmlite import ir
 
 from hhsr.kernels import cell_along as told
 from hhsr.kernels import runs as at
-from hhsr.kernels.either_lanes import Counted
 from hhsr.kernels.lane import MERGE
 from hhsr.kernels.layout import LANES, integers, tables
 from hhsr.kernels.stretch import excess_along
+from hhsr.kernels.table_lanes import CountedTables
 from tests.kernels.emitted import engine_of
 from tests.kernels.small_solids import arithmetic_of_c, solid  # noqa: F401
 from tests.kernels.test_smooth_runs import grazing, leaf_of, put_run
@@ -48,7 +48,7 @@ def in_arrays(blob: np.ndarray, runs: np.ndarray) -> np.ndarray:
     rows = np.zeros((told.GIVEN, COUNT))
     rows[told.RUN] = np.arange(COUNT)
     with np.errstate(all="ignore"):
-        on = Counted(runs, blob, integers(blob), tables(blob))
+        on = CountedTables(runs, blob, integers(blob), tables(blob))
         rows[told.KNOWN :] = told.settled(on, rows[told.RUN], TOLERANCE)
     return rows
 
@@ -147,7 +147,7 @@ def test_runs_that_no_cell_knows_are_left_open(blob: np.ndarray, runs: np.ndarra
 
 def test_the_bend_in_space_falls_by_the_direction() -> None:
     """In any direction, of a ball: F = |p|/R bends by |d|²/(R·|p|) across the ray, and not at all along it."""
-    on = Counted(np.zeros(1), np.zeros(1), np.zeros(1, dtype=int), np.zeros(1))
+    on = CountedTables(np.zeros(1), np.zeros(1), np.zeros(1, dtype=int), np.zeros(1))
     rng = np.random.default_rng(1)
 
     def share(p: np.ndarray, d: np.ndarray, reach: float) -> float:

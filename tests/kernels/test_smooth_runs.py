@@ -9,11 +9,11 @@ from hhsr.kernels import runs as at
 from hhsr.kernels import smooth_runs
 from hhsr.kernels.cell_along import BENDS, CELL_ROWS, KNOWN, settled
 from hhsr.kernels.crossing import scratch
-from hhsr.kernels.either_lanes import Counted
 from hhsr.kernels.lane import MERGE
 from hhsr.kernels.layout import LANES, OWNER_INTS, OWNER_RECORD, integers, tables
 from hhsr.kernels.settle_run import settle_run
 from hhsr.kernels.stretch import excess, excess_along
+from hhsr.kernels.table_lanes import CountedTables
 from tests.kernels.small_solids import arithmetic_of_c, solid  # noqa: F401
 
 COUNT = 150
@@ -72,7 +72,7 @@ def test_runs_have_the_crossings_of_f_along_them(blob: np.ndarray) -> None:
         p, d, begin, end = grazing(blob, rng)
         put_run(blob, runs, 0, p, d, begin, end)
         with np.errstate(all="ignore"):
-            told = settled(Counted(runs, blob, ints, tab), np.zeros(1), 0.001)
+            told = settled(CountedTables(runs, blob, ints, tab), np.zeros(1), 0.001)
         runs[0, at.BEND_ALONG] = told[BENDS - KNOWN][0]
         f, slope = excess_along(blob, ints, leaf, *(p + 0.5 * (begin + end) * d), *d)
         verdict = int(smooth_runs._prove(runs, 0, f, slope))
