@@ -16,9 +16,9 @@ from hhsr.kernels.layout import integers, tables
 from hhsr.kernels.nearest import seed_point
 from hhsr.kernels.patch import BEST, BEST_T, ENOUGH, FAR, FOOT, TOLERANCE, distance_to, offer
 from hhsr.kernels.seam import slide_from
-from hhsr.kernels.spans import close_spans, put_span, summit_of, tell_spans
+from hhsr.kernels.spans import SPAN_SIZE, VAIN, close_spans, put_span, summit_of, tell_spans
 from hhsr.kernels.tree import into_tree, out_of_tree
-from hhsr.kernels.unmanaged import managed, unmanaged
+from hhsr.kernels.unmanaged import entry, managed, unmanaged
 
 DEPTH = 0.88  # tolerances: a tenth is what the walk to the ends of a stretch may err
 ROUGHLY = 6.0  # tolerances: as nearly as a foot is sought that is to lower a bound of the depth
@@ -50,11 +50,11 @@ def _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, below, search):
     _offer_known(search, bx, by, bz)
     for way in range(2):
         x, y, z = (ax, ay, az) if way == 0 else (bx, by, bz)
-        # A way down from a seam comes back to it, if the seam is a valley.
-        slide_from(blob, ints, x, y, z, search)
+        # A way down from a seam comes back to it, if the seam is a valley; it was gone along then.
+        slid = slide_from(blob, ints, x, y, z, search)
         if search[BEST] < below:
             return
-        descend_from(blob, ints, tab, x, y, z, search)
+        descend_from(blob, ints, tab, x, y, z, not slid, search)
         if search[BEST] < below:
             return
 
@@ -125,6 +125,7 @@ def deepest(
         spans, 0, px, py, pz, dx, dy, dz, t0, spans[0, 1], spans[0, 2], spans[0, 3], t1, spans[0, 5], spans[0, 6],
         spans[0, 7],
     )  # fmt: skip
+    spans[0, VAIN] = 0.0
     used, slow, value, closed, summit = 1, np.int64(0), 0.0, 0.0, np.int64(FIRST_SUMMIT)
     for turn in range(2 * SPANS):
         s, value = 0, 0.0
@@ -141,8 +142,10 @@ def deepest(
         a, ax, ay, az = spans[s, 0], spans[s, 1], spans[s, 2], spans[s, 3]
         b, bx, by, bz = spans[s, 4], spans[s, 5], spans[s, 6], spans[s, 7]
         set_search(search, px + t * dx, py + t * dy, pz + t * dz, 0.0, 0.0, 0.0, ROUGHLY * tolerance)
-        if a < t < b:
+        vain = spans[s, VAIN] != 0.0  # a seed was, where this span was parted: the ends' points come first
+        if a < t < b and not vain:
             seed_point(blob, ints, tab, search)
+            vain = search[BEST] >= value
         known = search[BEST] < value - near and not climbs
         if climbs or (not known and slow >= PATIENCE):
             _offer_known(search, ax, ay, az)
@@ -150,6 +153,10 @@ def deepest(
         elif not known:
             _go_on(blob, ints, tab, ax, ay, az, bx, by, bz, value - near, search)
             known = search[BEST] < value - near
+            if not known and a < t < b and spans[s, VAIN] != 0.0:
+                seed_point(blob, ints, tab, search)
+                known = search[BEST] < value - near
+                vain = not known
             slow = slow + 1 if value - search[BEST] < LITTLE * (value - sure) else np.int64(0)
         if not known:
             # Nothing nearer is known, or little by little: what is the true distance there?
@@ -165,7 +172,9 @@ def deepest(
                     out[0], out[1], out[2], out[3] = t, search[FOOT], search[FOOT + 1], search[FOOT + 2]
         onto_surface(blob, ints, search)
         x, y, z = search[FOOT], search[FOOT + 1], search[FOOT + 2]
+        spans[s, VAIN] = 1.0 if vain else 0.0
         if a < t < b:
+            spans[used, VAIN] = spans[s, VAIN]
             put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, t, x, y, z)
             put_span(spans, used, px, py, pz, dx, dy, dz, t, x, y, z, b, bx, by, bz)
             used += 1
@@ -234,7 +243,7 @@ def _clearance(
 @managed
 def _clearance_scratch():
     """Return (ts, out, spans, lifted)."""
-    return np.empty(512), np.empty(4), np.empty((SPANS, 10)), np.empty(64)
+    return np.empty(512), np.empty(4), np.empty((SPANS, SPAN_SIZE)), np.empty(64)
 
 
 @njit(cache=True, error_model="numpy")
@@ -254,7 +263,7 @@ def clearance_one(blob, ax, ay, az, bx, by, bz, tolerance):
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def clearance_many(blob, starts, ends, order, tolerance, value, t, foot):
     """Fill (n,) clearance of the axes of LPS segments (m, 3) (no radius), (n,) where along it, (n, 3) surface points.
 

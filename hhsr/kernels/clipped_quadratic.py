@@ -8,14 +8,14 @@ import math
 import numpy as np
 
 from hhsr.kernels.cell import direction_of, minor_parts
-from hhsr.kernels.polygon import clip_polygon
-from hhsr.kernels.quadratic import bounding_quadratic
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.polygon import ROOM
+from hhsr.kernels.quadratic import bounding_quadratic, least_over_square
+from hhsr.kernels.unmanaged import inlined
 
 ROUNDING = 1e-6  # what the table's float32 leave of a cut's place, relative
 
 
-@unmanaged
+@inlined
 def least_over_polygon(c, ca, cb, aa, ab, bb, corners, size):
     """Return (least, a, b) of c + ca·a + cb·b + aa·a² + 2·ab·a·b + bb·b² over a convex polygon. corners: (size, 3)."""
     det = aa * bb - ab * ab
@@ -49,7 +49,44 @@ def least_over_polygon(c, ca, cb, aa, ab, bb, corners, size):
     return least, where_a, where_b
 
 
-@unmanaged
+@inlined
+def _square(half, corners):
+    """Write the corners of a square about 0; return how many they are."""
+    for corner in range(4):
+        corners[corner, 0] = half if corner == 1 or corner == 2 else -half
+        corners[corner, 1] = half if corner >= 2 else -half
+    return 4
+
+
+@inlined
+def clip_in_chart(corners, count, spare, na, nb, limit):
+    """Clip corners (ROOM, 3)[:count], (a, b, scratch), to na·a + nb·b ≤ limit, in place; return the new count."""
+    beyond = 0
+    for i in range(count):
+        corners[i, 2] = na * corners[i, 0] + nb * corners[i, 1] - limit
+        beyond += 1 if corners[i, 2] > 0.0 else 0
+    if beyond == 0:
+        return count
+    if beyond == count:
+        return 0
+    new = 0
+    for i in range(count):
+        j = i + 1 if i + 1 < count else 0
+        hi, hj = corners[i, 2], corners[j, 2]
+        if hi <= 0.0 and new < ROOM:
+            spare[new, 0], spare[new, 1] = corners[i, 0], corners[i, 1]
+            new += 1
+        if (hi <= 0.0) != (hj <= 0.0) and new < ROOM:
+            x = hi / (hi - hj)
+            spare[new, 0] = corners[i, 0] + x * (corners[j, 0] - corners[i, 0])
+            spare[new, 1] = corners[i, 1] + x * (corners[j, 1] - corners[i, 1])
+            new += 1
+    for i in range(new):
+        corners[i, 0], corners[i, 1] = spare[i, 0], spare[i, 1]
+    return new
+
+
+@inlined
 def clipped_is_clear(
     blob, planes, count, search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third, error, corners, spare
 ):  # fmt: skip
@@ -64,11 +101,7 @@ def clipped_is_clear(
     )
     if slack == np.inf:
         return False, 0.0, 0.0
-    for corner in range(4):
-        corners[corner, 0] = half if corner == 1 or corner == 2 else -half
-        corners[corner, 1] = half if corner >= 2 else -half
-        corners[corner, 2] = 0.0
-    size = np.int64(4)
+    size = np.int64(0)  # corners of what is left; 0: the square as it is
     x, y, z = direction_of(face, a, b)
     bend = 0.5 * abs(waa + wbb) + math.sqrt(0.25 * (waa - wbb) ** 2 + wab * wab)
     strays = (bend + kink + third * half * math.sqrt(2.0) / 3.0) * half * half
@@ -78,8 +111,17 @@ def clipped_is_clear(
         along = nx * x + ny * y + nz * z
         na, nb = minor_parts(face, nx, ny, nz)
         room = abs(place) * (strays + error) + ROUNDING * (abs(along) + abs(place) * w) - (along - place * w)
-        size = clip_polygon(corners, size, spare, na - place * wa, nb - place * wb, 0.0, room)
+        na, nb = na - place * wa, nb - place * wb
+        reach = (abs(na) + abs(nb)) * half
+        if reach <= room:
+            continue
+        if size == 0:
+            size = _square(half, corners)
+        size = clip_in_chart(corners, size, spare, na, nb, room)
         if size == 0:
             return True, 0.0, 0.0
-    least, da, db = least_over_polygon(c, ca, cb, aa, ab, bb, corners, size)
+    if size == 0:
+        least, da, db = least_over_square(c, ca, cb, aa, ab, bb, half)
+    else:
+        least, da, db = least_over_polygon(c, ca, cb, aa, ab, bb, corners, size)
     return least > slack, da, db

@@ -26,6 +26,7 @@ from hhsr.kernels.tree import into_leaf, owner_of, turn_out_of_leaf
 from hhsr.kernels.unmanaged import unmanaged
 
 STEPS = 10
+LONGEST = 0.25  # step, of a face's coordinates
 ROUGH = 4  # of them by the table, at most
 LEFT = 0.02  # tolerances: a point that the next step would bring no nearer is a foot
 SLACK = 0.1  # tolerances: a foot by the table is one where it is proven to lie this near to the surface; where it lies
@@ -33,11 +34,11 @@ SLACK = 0.1  # tolerances: a foot by the table is one where it is proven to lie 
 
 
 @unmanaged
-def descend(blob, ints, tab, owner, face, a, b, search):
+def descend(blob, ints, tab, owner, face, a, b, slides, search):
     """Offer the surface points on a way of steepest nearing from (a, b) of an owner; return whether it came to a foot.
 
-    search: of a point, tree's frame. The first steps are the table's. A foot of theirs is offered as far as the surface
-    may be: `onto_surface` makes it exact.
+    search: of a point, tree's frame. slides: where the way goes to and fro over a seam, go on along that. The first
+    steps are the table's. A foot of theirs is offered as far as the surface may be: `onto_surface` makes it exact.
     """
     last = np.inf
     rough, left = ROUGH, np.int64(-1)
@@ -110,9 +111,9 @@ def descend(blob, ints, tab, owner, face, a, b, search):
             det = aa * bb - ab * ab
         da, db = (bb * ra - ab * rb) / det, (aa * rb - ab * ra) / det
         move = max(abs(da), abs(db))
-        if move > 0.25:
-            da, db = da * (0.25 / move), db * (0.25 / move)
-            move = 0.25
+        if move > LONGEST:
+            da, db = da * (LONGEST / move), db * (LONGEST / move)
+            move = LONGEST
         if within and move > 0.9 * last:
             return False
         if rough < 0:
@@ -130,6 +131,8 @@ def descend(blob, ints, tab, owner, face, a, b, search):
             if new != owner:
                 if new == left:
                     # To and fro: each leaf's foot lies beyond the cut. The nearest point is one of the seam.
+                    if not slides:
+                        return False
                     cut = _worst_plane(blob, planes, count, x, y, z)
                     face, a, b, _ = face_of(x, y, z)
                     slide(blob, ints, owner, cut, face, a, b, search)
@@ -174,11 +177,11 @@ def onto_surface(blob, ints, search):
 
 
 @unmanaged
-def descend_from(blob, ints, tab, x, y, z, search):
+def descend_from(blob, ints, tab, x, y, z, slides, search):
     """Do as `descend` from a surface point of the tree's frame."""
     owner = owner_of(blob, ints, 0, x, y, z)
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
     if ints[o + OWNER_KIND] == MODEL:
         x, y, z = into_leaf(blob, ints, ints[o + OWNER_RECORD], x, y, z)
         face, a, b, _ = face_of(x, y, z)
-        descend(blob, ints, tab, owner, face, a, b, search)
+        descend(blob, ints, tab, owner, face, a, b, slides, search)

@@ -87,7 +87,7 @@ def seed_point(blob, ints, tab, search):
     code = ints[ints[FACET_CODES] + seed_at(blob, ints, search[START], search[START + 1], search[START + 2])]
     leaf = ints[ints[OWNER_INTS] + OWNER_INT_SIZE * (code >> 24) + OWNER_RECORD]
     _, face, a, b, _ = facet_cell(ints, leaf, code)
-    descend(blob, ints, tab, code >> 24, face, a, b, search)
+    descend(blob, ints, tab, code >> 24, face, a, b, np.bool_(True), search)
 
 
 @unmanaged

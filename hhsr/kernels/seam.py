@@ -84,12 +84,12 @@ def slide(blob, ints, owner, cut, face, a, b, search):
 
 @unmanaged
 def slide_from(blob, ints, x, y, z, search):
-    """Do as `slide` from a surface point of the tree's frame; nothing where it is on no seam."""
+    """Do as `slide` from a surface point of the tree's frame; return whether it is on a seam."""
     owner = owner_of(blob, ints, 0, x, y, z)
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
     leaf = ints[o + OWNER_RECORD]
     if ints[o + OWNER_KIND] != MODEL or not has_jets(ints, leaf):
-        return
+        return False
     planes = ints[o + OWNER_PLANE_FLOATS]
     x, y, z = into_leaf(blob, ints, leaf, x, y, z)
     least, cut = NEAR, -1
@@ -100,3 +100,4 @@ def slide_from(blob, ints, x, y, z, search):
     if cut >= 0:
         face, a, b, _ = face_of(x, y, z)
         slide(blob, ints, owner, cut, face, a, b, search)
+    return cut >= 0

@@ -1,17 +1,19 @@
 """Spans of a stretch of a segment inside the solid: what is known of the depth between two places of it.
 
-A row of ten: t of the first end and a surface point, t of the last end and a surface point, the highest bound between
-them, and its t. At every place of a span the depth is no more than the distance to either point.
+A row: t of the first end and a surface point, t of the last end and a surface point, the highest bound between them,
+and its t; last, whether a seed was farther than what was known, where the span was parted. At every place of a span the
+depth is no more than the distance to either point.
 """
 
 import math
 
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import inlined, unmanaged
 
+VAIN, SPAN_SIZE = 10, 11
 NEIGHBOURS = 4.0  # lengths of a span: surface points no farther apart are on one bend of the surface
 
 
-@unmanaged
+@inlined
 def _highest(px, py, pz, dx, dy, dz, t0, t1, ax, ay, az, bx, by, bz):
     """Return the greatest min(|p(t) − a|, |p(t) − b|)² on [t0, t1], and its t: an upper bound of the distance²."""
     dd = dx * dx + dy * dy + dz * dz
@@ -46,7 +48,7 @@ def put_span(spans, s, px, py, pz, dx, dy, dz, a, ax, ay, az, b, bx, by, bz):
     spans[s, 8] = math.sqrt(value2)
 
 
-@unmanaged
+@inlined
 def tell_spans(spans, used, px, py, pz, dx, dy, dz, x, y, z):
     """Let a surface point stand for the ends of all spans that it is nearer to than their own."""
     for s in range(used):
@@ -77,7 +79,7 @@ def _rise(spans, s, o, px, py, pz, dx, dy, dz):
     return 0.0, (1.0 if o == 0 else -1.0) * math.sqrt(dx * dx + dy * dy + dz * dz)
 
 
-@unmanaged
+@inlined
 def summit_of(spans, used, px, py, pz, dx, dy, dz, s, t):
     """Return (s, t) of a span and a place in it where it is likely deepest; those given where none is better.
 
@@ -99,7 +101,7 @@ def summit_of(spans, used, px, py, pz, dx, dy, dz, s, t):
     return s, t
 
 
-@unmanaged
+@inlined
 def close_spans(spans, used, high, px, py, pz, dx, dy, dz, begin, end):
     """Take [begin, end] out of the spans that are bounded by more than `high`; return how many spans are left."""
     for s in range(used - 1, -1, -1):

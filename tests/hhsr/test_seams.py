@@ -38,7 +38,7 @@ def test_a_slide_ends_at_the_seams_nearest_point(seed: int) -> None:
         search[START : START + 3] = into_tree(blob, ints, *point)
         search[BEST], search[TOLERANCE], search[LENGTH2] = np.linalg.norm(point - start), 0.01, 0.0
         begin = search[BEST]
-        slide_from(blob, ints, *into_tree(blob, ints, *start), search)
+        assert slide_from(blob, ints, *into_tree(blob, ints, *start), search)
         nearest = np.hypot(point[0], away - ring)
         assert nearest - 1e-3 <= search[BEST] <= begin
         assert search[BEST] <= nearest + 0.01
@@ -53,7 +53,7 @@ def test_off_a_seam_nothing_slides() -> None:
     blob = two_balls()
     search = np.zeros(SEARCH_SIZE)
     search[START : START + 3], search[BEST], search[TOLERANCE] = [45.0, 3.0, 0.0], 6.0, 0.01
-    slide_from(blob, integers(blob), 40.0, 0.0, 0.0, search)
+    assert not slide_from(blob, integers(blob), 40.0, 0.0, 0.0, search)
     assert search[BEST] == 6.0
 
 
@@ -74,7 +74,11 @@ def test_a_way_down_to_and_fro_between_two_leaves_ends_on_their_seam(seed: int) 
         search = np.zeros(SEARCH_SIZE)
         search[START : START + 3] = into_tree(blob, ints, *point)
         search[BEST], search[TOLERANCE], search[LENGTH2] = FAR, 0.01, 0.0
-        descend_from(blob, ints, tab, *into_tree(blob, ints, *start), search)
+        # Where it was gone along before, the way ends there and finds no point of the seam.
+        assert not descend_from(blob, ints, tab, *into_tree(blob, ints, *start), np.bool_(False), search)
+        assert search[BEST] == FAR or np.hypot(search[FOOT + 1], search[FOOT + 2]) != pytest.approx(ring, abs=1e-3)
+        search[BEST] = FAR
+        descend_from(blob, ints, tab, *into_tree(blob, ints, *start), np.bool_(True), search)
         nearest = np.hypot(point[0], height - ring)
         assert nearest - 1e-9 <= search[BEST] <= nearest + 0.001
         assert np.hypot(search[FOOT + 1], search[FOOT + 2]) == pytest.approx(ring, abs=1e-3)
