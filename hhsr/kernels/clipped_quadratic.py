@@ -1,6 +1,8 @@
 """A square of a leaf's directions that cuts part, against a point or a segment: the quadratic over the region's part.
 
-A cut n·p ≤ c is n·dir ≤ c·W in the chart: a line there, but for c times what W strays from its tangent.
+A cut n·p ≤ c is n·dir ≤ c·W in the chart: a line there, but for c times what W strays from its tangent. Where lines do
+not decide, a multiple of n·dir − c·W is added, which is not above 0 in the region: with the right one the least value
+is that of the region's part.
 """
 
 import math
@@ -10,7 +12,7 @@ import numpy as np
 from hhsr.kernels.cell import direction_of, minor_parts
 from hhsr.kernels.polygon import ROOM
 from hhsr.kernels.quadratic import bounding_quadratic, least_over_square
-from hhsr.kernels.unmanaged import inlined
+from hhsr.kernels.unmanaged import inlined, unmanaged
 
 ROUNDING = 1e-6  # what the table's float32 leave of a cut's place, relative
 
@@ -124,4 +126,49 @@ def clipped_is_clear(
         least, da, db = least_over_square(c, ca, cb, aa, ab, bb, half)
     else:
         least, da, db = least_over_polygon(c, ca, cb, aa, ab, bb, corners, size)
-    return least > slack, da, db
+    if least > slack:
+        return True, da, db
+    clear = _clear_beyond_cuts(
+        blob, planes, count, face, x, y, z, half, w, wa, wb, waa, wab, wbb, kink + third * half * math.sqrt(2.0) / 3.0,
+        error, c, ca, cb, aa, ab, bb, slack, da, db,
+    )  # fmt: skip
+    return clear, da, db
+
+
+@unmanaged
+def _clear_beyond_cuts(
+    blob, planes, count, face, x, y, z, half, w, wa, wb, waa, wab, wbb, rest, error, c, ca, cb, aa, ab, bb, slack, da,
+    db,
+):  # fmt: skip
+    """Return whether a multiple of a cut's own quadratic, not above 0 in the region, lifts the other above the slack.
+
+    Unlike a line in the chart it has W's bend. δ: where the quadratic is least by lines; there the multiple balances
+    both. rest: W strays from its quadratic by no more than rest/2·|δ|² and the error.
+    """
+    fa, fb = ca + 2.0 * (aa * da + ab * db), cb + 2.0 * (ab * da + bb * db)
+    edge = half * (1.0 - 1e-9)
+    for k in range(count):
+        o = planes + 4 * k
+        nx, ny, nz, place = blob[o], blob[o + 1], blob[o + 2], blob[o + 3]
+        along = nx * x + ny * y + nz * z
+        na, nb = minor_parts(face, nx, ny, nz)
+        na, nb = na - place * wa, nb - place * wb
+        ga, gb = na - place * (waa * da + wab * db), nb - place * (wab * da + wbb * db)
+        if abs(da) > edge:
+            ga = 0.0
+        if abs(db) > edge:
+            gb = 0.0
+        steep = ga * ga + gb * gb
+        times = -(fa * ga + fb * gb) / steep if steep > 0.0 else 0.0
+        if times <= 0.0:
+            continue
+        bent = 0.5 * times * place
+        more = 0.5 * times * abs(place) * rest
+        room = abs(place) * error + ROUNDING * (abs(along) + abs(place) * w)
+        least, _, _ = least_over_square(
+            c + times * (along - place * w - room), ca + times * na, cb + times * nb, aa - bent * waa - more,
+            ab - bent * wab, bb - bent * wbb - more, half,
+        )  # fmt: skip
+        if least > slack:
+            return True
+    return False

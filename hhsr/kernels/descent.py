@@ -42,6 +42,7 @@ def descend(blob, ints, tab, owner, face, a, b, slides, search):
     """
     last = np.inf
     rough, left = ROUGH, np.int64(-1)
+    nearest, from_a, from_b, from_face, from_owner = np.inf, a, b, face, owner
     for _ in range(STEPS):
         o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
         leaf = ints[o + OWNER_RECORD]
@@ -64,6 +65,11 @@ def descend(blob, ints, tab, owner, face, a, b, slides, search):
         x, y, z = x * m, y * m, z * m
         rx, ry, rz = px - x, py - y, pz - z
         distance = math.sqrt(rx * rx + ry * ry + rz * rz)
+        if face != from_face or owner != from_owner or distance <= nearest + LEFT * search[TOLERANCE]:
+            nearest, from_a, from_b, from_face, from_owner = distance, a, b, face, owner
+        else:  # a step too far: half of it
+            a, b = 0.5 * (a + from_a), 0.5 * (b + from_b)
+            continue
         within = rough < 0 and not outside_region(blob, planes, count, x, y, z, 1e-9)
         if within and distance < search[BEST]:
             ox, oy, oz = turn_out_of_leaf(blob, frame, x, y, z)

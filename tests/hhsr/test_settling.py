@@ -12,13 +12,14 @@ from hhsr.compiled import compile_tree
 from hhsr.kernels import layout as at
 from hhsr.kernels.cell import direction_of, inverse_radius
 from hhsr.kernels.clipped_quadratic import clip_in_chart, clipped_is_clear, least_over_polygon
+from hhsr.kernels.descent import descend_from
 from hhsr.kernels.disc_bounds import BLOCK, LOOSE, WIDE, bound_to_point, bound_to_segment
 from hhsr.kernels.facets import facet_cell
 from hhsr.kernels.foot import jump_over, leaf_is_free
 from hhsr.kernels.jet import inverse_radius_bend
 from hhsr.kernels.layout import integers, tables
 from hhsr.kernels.maps import jet_near, jet_of, rests_over
-from hhsr.kernels.patch import LENGTH2, SEARCH_SIZE, START, VECTOR
+from hhsr.kernels.patch import BEST, FAR, LENGTH2, SEARCH_SIZE, START, TOLERANCE, VECTOR
 from hhsr.kernels.polygon import ROOM
 from hhsr.kernels.quadratic import least_over_square, square_is_clear
 from hhsr.kernels.tree import turn_out_of_leaf
@@ -156,12 +157,12 @@ def test_the_table_holds_the_jet_of_a_surface_as_near_as_said(one: ModelLeaf) ->
     assert seen > 60
 
 
-@pytest.mark.parametrize("one", LEAVES)
-def test_a_clipped_square_is_called_clear_only_where_it_is(one: ModelLeaf) -> None:
+@pytest.mark.parametrize(("one", "known"), list(zip(LEAVES, (10, 5, 0), strict=True)))
+def test_a_clipped_square_is_called_clear_only_where_it_is(one: ModelLeaf, known: int) -> None:
     """By cuts through the square, its corners and its neighbourhood, one to three at a time."""
     rng = np.random.default_rng(9)
     grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 31)] * 2), -1).reshape(-1, 2)
-    called = refused = more = 0
+    called = refused = more = sharp = 0
     for blob, record, (slot, face, a, b, half) in facets(one, 60, rng):
         tab = tables(blob)
         kink, third = float(tab[slot + at.KINK]), float(tab[slot + at.THIRD])
@@ -182,7 +183,10 @@ def test_a_clipped_square_is_called_clear_only_where_it_is(one: ModelLeaf) -> No
         nearest = np.linalg.norm(held - search[START : START + 3], axis=1).min() if len(held) else np.inf
         whole = np.linalg.norm(points - search[START : START + 3], axis=1).min()
         corners, spare = np.empty((ROOM, 3)), np.empty((ROOM, 3))
-        for radius in (0.5 * whole, whole, 0.5 * (whole + min(nearest, 2 * whole)), nearest * 1.0001, nearest * 1.1):
+        most = nearest - 0.02 * half / jet[0]
+        for radius in (
+            0.5 * whole, whole, 0.5 * (whole + min(nearest, 2 * whole)), most, nearest * 1.0001, nearest * 1.1
+        ):  # fmt: skip
             if not np.isfinite(radius):
                 continue
             clear, da, db = clipped_is_clear(
@@ -193,9 +197,32 @@ def test_a_clipped_square_is_called_clear_only_where_it_is(one: ModelLeaf) -> No
             assert not (clear and radius > nearest)
             called, refused = called + clear, refused + (not clear)
             more += clear and radius > whole * 1.001
+            sharp += clear and radius == most and most > whole
     assert called > 60
     assert refused > 20
     assert more > 10  # the cut's own doing
+    assert sharp > known  # by lines alone 8, 3 and 0
+
+
+@pytest.mark.parametrize("one", LEAVES)
+def test_a_way_down_seldom_ends_farther_than_it_began(one: ModelLeaf) -> None:
+    """Points deep inside, where much of the surface is about as far, from surface points of a face near them."""
+    rng = np.random.default_rng(11)
+    blob = compile_tree(Tree(one, frozen(np.zeros(6)))).blob
+    ints, tab = integers(blob), tables(blob)
+    record = ints[ints[at.OWNER_INTS] + at.OWNER_RECORD]
+    centre, found, farther = one.centre, 0, 0
+    for face in range(6):
+        points = surface(blob, record, face, *rng.uniform(-0.9, 0.9, (2, 300)))
+        for inside in points[:60] * rng.uniform(0.0, 0.7, (60, 1)):
+            start = points[np.linalg.norm(points - inside, axis=1).argmin()]
+            search = np.zeros(SEARCH_SIZE)
+            search[START : START + 3], search[BEST], search[TOLERANCE] = inside + centre, FAR, 0.01
+            descend_from(blob, ints, tab, *(start + centre), np.bool_(True), search)
+            found += search[BEST] < FAR
+            farther += FAR > search[BEST] > np.linalg.norm(start - inside) + 1e-3
+    assert found > 200
+    assert farther < 20  # half of those from rough leaves, where steps too far are taken as they are
 
 
 @pytest.mark.parametrize("one", LEAVES)
