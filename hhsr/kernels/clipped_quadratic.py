@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from hhsr.kernels.cell import direction_of, minor_parts
-from hhsr.kernels.polygon import ROOM
+from hhsr.kernels.polygon import clip_in_chart
 from hhsr.kernels.quadratic import bounding_quadratic, least_over_square
 from hhsr.kernels.unmanaged import inlined, unmanaged
 
@@ -61,34 +61,6 @@ def _square(half, corners):
 
 
 @inlined
-def clip_in_chart(corners, count, spare, na, nb, limit):
-    """Clip corners (ROOM, 3)[:count], (a, b, scratch), to na·a + nb·b ≤ limit, in place; return the new count."""
-    beyond = 0
-    for i in range(count):
-        corners[i, 2] = na * corners[i, 0] + nb * corners[i, 1] - limit
-        beyond += 1 if corners[i, 2] > 0.0 else 0
-    if beyond == 0:
-        return count
-    if beyond == count:
-        return 0
-    new = 0
-    for i in range(count):
-        j = i + 1 if i + 1 < count else 0
-        hi, hj = corners[i, 2], corners[j, 2]
-        if hi <= 0.0 and new < ROOM:
-            spare[new, 0], spare[new, 1] = corners[i, 0], corners[i, 1]
-            new += 1
-        if (hi <= 0.0) != (hj <= 0.0) and new < ROOM:
-            x = hi / (hi - hj)
-            spare[new, 0] = corners[i, 0] + x * (corners[j, 0] - corners[i, 0])
-            spare[new, 1] = corners[i, 1] + x * (corners[j, 1] - corners[i, 1])
-            new += 1
-    for i in range(new):
-        corners[i, 0], corners[i, 1] = spare[i, 0], spare[i, 1]
-    return new
-
-
-@inlined
 def clipped_is_clear(
     blob, planes, count, search, radius, face, a, b, half, w, wa, wb, waa, wab, wbb, kink, third, error, corners, spare
 ):  # fmt: skip
@@ -106,7 +78,8 @@ def clipped_is_clear(
     size = np.int64(0)  # corners of what is left; 0: the square as it is
     x, y, z = direction_of(face, a, b)
     bend = 0.5 * abs(waa + wbb) + math.sqrt(0.25 * (waa - wbb) ** 2 + wab * wab)
-    strays = (bend + kink + third * half * math.sqrt(2.0) / 3.0) * half * half
+    rest = kink + third * half * math.sqrt(2.0) / 3.0
+    strays = (bend + rest) * half * half
     for k in range(count):
         o = planes + 4 * k
         nx, ny, nz, place = blob[o], blob[o + 1], blob[o + 2], blob[o + 3]
@@ -129,8 +102,8 @@ def clipped_is_clear(
     if least > slack:
         return True, da, db
     clear = _clear_beyond_cuts(
-        blob, planes, count, face, x, y, z, half, w, wa, wb, waa, wab, wbb, kink + third * half * math.sqrt(2.0) / 3.0,
-        error, c, ca, cb, aa, ab, bb, slack, da, db,
+        blob, planes, count, face, x, y, z, half, w, wa, wb, waa, wab, wbb, rest, error, c, ca, cb, aa, ab, bb, slack,
+        da, db,
     )  # fmt: skip
     return clear, da, db
 

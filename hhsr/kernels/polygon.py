@@ -1,8 +1,8 @@
-"""Convex polygons in space: clipped by half-spaces, and their distance to a point or a segment."""
+"""Convex polygons in space or in a chart: clipped by half-spaces, and their distance to a point or a segment."""
 
 import math
 
-from hhsr.kernels.unmanaged import unmanaged
+from hhsr.kernels.unmanaged import inlined, unmanaged
 
 ROOM = 24  # corners: four, and one more for each clipping plane
 
@@ -38,6 +38,34 @@ def clip_polygon(corners, count, spare, nx, ny, nz, limit):
     for i in range(new):
         for k in range(3):
             corners[i, k] = spare[i, k]
+    return new
+
+
+@inlined
+def clip_in_chart(corners, count, spare, na, nb, limit):
+    """Clip corners (ROOM, 3)[:count], (a, b, scratch), to na·a + nb·b ≤ limit, in place; return the new count."""
+    beyond = 0
+    for i in range(count):
+        corners[i, 2] = na * corners[i, 0] + nb * corners[i, 1] - limit
+        beyond += 1 if corners[i, 2] > 0.0 else 0
+    if beyond == 0:
+        return count
+    if beyond == count:
+        return 0
+    new = 0
+    for i in range(count):
+        j = i + 1 if i + 1 < count else 0
+        hi, hj = corners[i, 2], corners[j, 2]
+        if hi <= 0.0 and new < ROOM:
+            spare[new, 0], spare[new, 1] = corners[i, 0], corners[i, 1]
+            new += 1
+        if (hi <= 0.0) != (hj <= 0.0) and new < ROOM:
+            x = hi / (hi - hj)
+            spare[new, 0] = corners[i, 0] + x * (corners[j, 0] - corners[i, 0])
+            spare[new, 1] = corners[i, 1] + x * (corners[j, 1] - corners[i, 1])
+            new += 1
+    for i in range(new):
+        corners[i, 0], corners[i, 1] = spare[i, 0], spare[i, 1]
     return new
 
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from hhsr.compiled import compile_tree
 from hhsr.kernels import layout as at
 from hhsr.kernels.cell import direction_of, inverse_radius
-from hhsr.kernels.clipped_quadratic import clip_in_chart, clipped_is_clear, least_over_polygon
+from hhsr.kernels.clipped_quadratic import clipped_is_clear, least_over_polygon
 from hhsr.kernels.descent import descend_from
 from hhsr.kernels.disc_bounds import BLOCK, LOOSE, WIDE, bound_to_point, bound_to_segment
 from hhsr.kernels.facets import facet_cell
@@ -20,7 +20,7 @@ from hhsr.kernels.jet import inverse_radius_bend
 from hhsr.kernels.layout import integers, tables
 from hhsr.kernels.maps import jet_near, jet_of, rests_over
 from hhsr.kernels.patch import BEST, FAR, LENGTH2, SEARCH_SIZE, START, TOLERANCE, VECTOR
-from hhsr.kernels.polygon import ROOM
+from hhsr.kernels.polygon import ROOM, clip_in_chart
 from hhsr.kernels.quadratic import least_over_square, square_is_clear
 from hhsr.kernels.tree import turn_out_of_leaf
 from hhsr.model import CentreGrid, FloatArray, ModelLeaf, ScaleField, Superquadric, Tree, frozen
