@@ -21,6 +21,7 @@ class Crossings(NamedTuple):
 
     offsets: (n + 1,). t: (m,) share of the segment, in [0, 1]. points: (m, 3) LPS mm. entering: (m,) bool.
     valid: (n,) bool, False where a segment was not finite (asked with on_invalid="mark").
+    Of a segment asked alone offsets, entering and valid are read-only.
     """
 
     offsets: IntArray
@@ -53,7 +54,20 @@ class Profile(NamedTuple):
 
 def is_point(value: object) -> TypeGuard[FloatArray]:
     """Return whether a value is a float64 array (3,): what single calls take without a copy."""
-    return type(value) is np.ndarray and value.shape == (3,) and value.dtype == np.float64
+    return type(value) is _ARRAY and value.shape == (3,) and value.dtype == _FLOAT
+
+
+def _fixed(values: list[Any], dtype: type) -> NDArray[Any]:
+    array: NDArray[Any] = np.array(values, dtype)
+    array.setflags(write=False)
+    return array
+
+
+_ARRAY, _FLOAT = np.ndarray, np.dtype(np.float64)
+_VALID = _fixed([True], np.bool_)
+# Offsets and entering by what `cross_one` returns: entering and leaving alternate.
+_OFFSETS = [_fixed([0, code // 2], np.int64) for code in range(2 * ROOM + 2)]
+_ENTERING = [_fixed([(k + code) % 2 == 0 for k in range(code // 2)], np.bool_) for code in range(2 * ROOM + 2)]
 
 
 def crossings_of_one(
@@ -61,15 +75,15 @@ def crossings_of_one(
 ) -> Crossings | None:
     """Return the crossings of one segment (3,) → (3,); None where it is not finite, or has more than there is room for.
 
-    What the tuple holds is cut from four arrays that one call fills: half of a single call's time would go into more.
+    A single call's time goes mostly into what it returns: all but t and points was made before, and is read-only.
     """
-    offsets, t = np.empty(2, dtype=np.int64), np.empty(ROOM)
-    points, entering = np.empty((ROOM, 3)), np.empty(ROOM + 2, dtype=np.bool_)
+    t, points = np.empty(ROOM), np.empty((ROOM, 3))
     (ax, ay, az), (bx, by, bz) = start.tolist(), end.tolist()
-    count = cross_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance, offsets, t, points, entering)
-    if count < 0:
+    code = cross_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance, t, points)
+    if code < 0:
         return None
-    return Crossings(offsets, t[:count], points[:count], entering[:count], entering[ROOM : ROOM + 1])
+    count = code // 2
+    return tuple.__new__(Crossings, (_OFFSETS[code], t[:count], points[:count], _ENTERING[code], _VALID))
 
 
 def curve(points: ArrayLike) -> FloatArray:

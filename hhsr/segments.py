@@ -49,9 +49,8 @@ def _cross_alone(
     """Return whether one segment starts inside, and (k,) t of its crossings, as many as there are."""
     (ax, ay, az), (bx, by, bz), room = start.tolist(), end.tolist(), ROOM
     while True:
-        offsets, t = np.empty(2, dtype=np.int64), np.empty(room)
-        points, entering = np.empty((room, 3)), np.empty(room + 2, dtype=np.bool_)
-        count = cross_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance, offsets, t, points, entering)
-        if count >= 0:
-            return bool(entering[room + 1]), t[:count]
+        t, points = np.empty(room), np.empty((room, 3))
+        code = cross_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance, t, points)
+        if code >= 0:
+            return code % 2 == 1, t[: code // 2]
         room *= 4

@@ -152,7 +152,7 @@ class Shape:
 
         on_invalid="mark": int8 instead, 1 inside, 0 outside, −1 where a point is not finite (else that is InputError).
         """
-        if type(points) is np.ndarray and points.shape == (3,) and points.dtype == np.float64:
+        if is_point(points):
             code = contains_kernels.contains_one(self._blob, *points.tolist())
             if code >= 0 and on_invalid == "raise":
                 return code == 1

@@ -94,11 +94,10 @@ def follow_segment(
 
 
 @njit(cache=True, error_model="numpy")
-def cross_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance, offsets, t, points, entering):
-    """Follow one LPS segment; return how many crossings it has, −1 where not finite or more than t (k,) holds.
+def cross_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance, t, points):
+    """Follow one LPS segment and fill t (k,) and points (k, 3) with its crossings, in order.
 
-    Fills offsets (2,), t, points (k, 3), entering (k + 2,), the last but one true: all that `Crossings` holds; and the
-    last: whether it starts inside.
+    Return twice their number, one more where it starts inside; −1 where not finite or more than t holds.
     """
     ints, tab = integers(blob), tables(blob)
     if not math.isfinite(ax + ay + az + bx + by + bz):
@@ -112,14 +111,10 @@ def cross_one(blob, ax, ay, az, bx, by, bz, resolution, tolerance, offsets, t, p
     )  # fmt: skip
     if count > t.shape[0]:
         return -1
-    offsets[0], offsets[1] = 0, count
-    entering[t.shape[0]], entering[t.shape[0] + 1] = True, inside
     for k in range(count):
-        inside = not inside
-        entering[k] = inside
         points[k, 0], points[k, 1] = ax + t[k] * (bx - ax), ay + t[k] * (by - ay)
         points[k, 2] = az + t[k] * (bz - az)
-    return count
+    return 2 * count + (1 if inside else 0)
 
 
 @njit(cache=True, error_model="numpy")
