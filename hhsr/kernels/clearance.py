@@ -22,16 +22,15 @@ from hhsr.kernels.unmanaged import entry, managed, unmanaged
 
 DEPTH = 0.88  # tolerances: a tenth is what the walk to the ends of a stretch may err
 ROUGHLY = 6.0  # tolerances: as nearly as a foot is sought that is to lower a bound of the depth
-PATIENCE = 2  # ways on, one after another, that lower a bound of the depth by little
-LITTLE = 0.3  # of what is open
 NEAR = 0.5  # tolerances: a bound is lowered only by a point that is nearer by this
 CLOSE = 0.85  # tolerances: as nearly as the distance is asked where a bound is highest; the rest closes spans beside
 NEARER = 0.3  # tolerances: a point nearer by this than what was known leaves too little to close them: a search may end
 AWAY = 4.0  # tolerances: so does one that is nearer by this where it was likely deepest
-SAME = 1.0  # tolerances: where a search found so little, ways on find nothing
+SAME = 1.0  # tolerances: where a search found so little, ways on from known points find nothing
 WALKED = 0.12  # tolerances: deeper than what may lie outside between a walked end and the surface
-FIRST_SUMMIT = 7  # parts: then it is asked where it is likely deepest, and at each twice as many
+FIRST_SUMMIT = 12  # parts: then it is asked where it is likely deepest, and at each twice as many
 ROOM = 0.65  # tolerances: as nearly as the distance is asked there; what is left, and the slack, go to a moved segment
+WORTH = 8  # open spans: fewer are parted in less time than it takes to follow a moved segment
 SLACK = 0.1  # tolerances: as much as the walk of a moved segment may err
 SPANS = 256  # parts of one segment's stretch inside
 
@@ -66,15 +65,16 @@ def lift(
     """Take out of the spans what is no deeper than `high`, as far as one moved segment shows; return how many are left.
 
     The segment is moved the way from p(t) to a surface point, by `high` less the slack: where it then is outside, the
-    surface is no farther than it was moved. Slack: as much as the walk may err.
+    surface is no farther than it was moved. Slack: as much as the walk may err. Not asked where few spans are
+    open.
     """
     vx, vy, vz = x - (px + t * dx), y - (py + t * dy), z - (pz + t * dz)
     length = math.sqrt(vx * vx + vy * vy + vz * vz)
-    low, top = np.inf, -np.inf
+    low, top, open_spans = np.inf, -np.inf, 0
     for s in range(used):
         if spans[s, 8] > high:
-            low, top = min(low, spans[s, 0]), max(top, spans[s, 4])
-    if not (low < top and length > slack and high > slack):
+            low, top, open_spans = min(low, spans[s, 0]), max(top, spans[s, 4]), open_spans + 1
+    if open_spans < WORTH or not (low < top and length > slack and high > slack):
         return used
     share = (high - slack) / length
     vx, vy, vz = px + share * vx, py + share * vy, pz + share * vz
@@ -126,7 +126,7 @@ def deepest(
         spans[0, 7],
     )  # fmt: skip
     spans[0, VAIN] = 0.0
-    used, slow, value, closed, summit = 1, np.int64(0), 0.0, 0.0, np.int64(FIRST_SUMMIT)
+    used, tight, value, closed, summit = 1, False, 0.0, 0.0, np.int64(FIRST_SUMMIT)
     for turn in range(2 * SPANS):
         s, value = 0, 0.0
         for k in range(used):
@@ -147,7 +147,7 @@ def deepest(
             seed_point(blob, ints, tab, search)
             vain = search[BEST] >= value
         known = search[BEST] < value - near and not climbs
-        if climbs or (not known and slow >= PATIENCE):
+        if climbs or (not known and tight):
             _offer_known(search, ax, ay, az)
             _offer_known(search, bx, by, bz)
         elif not known:
@@ -157,15 +157,14 @@ def deepest(
                 seed_point(blob, ints, tab, search)
                 known = search[BEST] < value - near
                 vain = not known
-            slow = slow + 1 if value - search[BEST] < LITTLE * (value - sure) else np.int64(0)
         if not known:
-            # Nothing nearer is known, or little by little: what is the true distance there?
+            # Nothing nearer is known: what is the true distance there?
             before = search[BEST]
             room = ROOM * tolerance if climbs else CLOSE * tolerance - max(value - before, 0.0)
             # A place where it is less deep than the bound says is not the deepest: what is nearer there will do.
             search[TOLERANCE], search[ENOUGH] = room, before - (AWAY if climbs else NEARER) * tolerance
             proven = search_surface(blob, ints, tab, search, local, nodes, keys, corners, spare, rects, np.bool_(True))
-            slow = np.int64(PATIENCE) if before - search[BEST] < SAME * tolerance else np.int64(0)
+            tight = before - search[BEST] < SAME * tolerance
             if proven and search[BEST] - room > max(sure, WALKED * tolerance):
                 sure = search[BEST] - room
                 if search[BEST] > floor:
