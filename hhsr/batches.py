@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
-from threading import Lock, local
 from typing import Any
 
 import numba
@@ -15,31 +13,12 @@ from numpy.typing import NDArray
 
 from hhsr.kernels.curve_order import order_along_curve
 from hhsr.model import FloatArray
+from hhsr.workers import hand_out, is_working, set_working
 
+CORES = os.cpu_count() or 1  # the system takes as long to say so as 3,000 points take
 SHARE = 0.5  # of what is left, for each thread, is a part
 LEAST = 8  # as many of the last parts make the smallest batch that is parted
 FEW = 2_000
-_POOLS: dict[int, ThreadPoolExecutor] = {}
-_OPENING = Lock()
-_THREAD = local()
-
-
-def _forget() -> None:
-    """Begin anew in a forked child."""
-    _POOLS.clear()
-    _OPENING.release()
-
-
-if hasattr(os, "register_at_fork"):  # not on Windows; a child has no threads but its own
-    os.register_at_fork(before=_OPENING.acquire, after_in_parent=_OPENING.release, after_in_child=_forget)
-
-
-def _pool(threads: int) -> ThreadPoolExecutor:
-    """Return the pool of so many threads, kept: to start them takes as long as 5,000 points."""
-    with _OPENING:
-        if threads not in _POOLS:
-            _POOLS[threads] = ThreadPoolExecutor(threads, "hhsr", lambda: setattr(_THREAD, "busy", True))
-        return _POOLS[threads]
 
 
 def _edges(count: int, threads: int, least: int) -> list[int]:
@@ -56,8 +35,8 @@ def in_parts(count: int, smallest: int, work: Callable[[int, int], Any]) -> list
 
     Threads: `numba.get_num_threads()`, at most the machine's. A row's answer must not depend on its part.
     """
-    threads = min(numba.get_num_threads(), os.cpu_count() or 1, count // max(smallest, 1))
-    if threads <= 1 or getattr(_THREAD, "busy", False):  # a part's own parts: a thread that waits for them helps none
+    threads = min(numba.get_num_threads(), CORES, count // max(smallest, 1))
+    if threads <= 1 or is_working():  # a part's own parts: a thread that waits for them helps none
         return [work(0, count)]
     edges = _edges(count, threads, max(smallest // LEAST, 1))
     results: list[Any] = [None] * (len(edges) - 1)
@@ -71,18 +50,18 @@ def in_parts(count: int, smallest: int, work: Callable[[int, int], Any]) -> list
                 return
             results[k] = work(edges[k], edges[k + 1])
 
-    # The caller works too: to wake one thread and wait for it costs as much as some thousand points.
-    others = [_pool(threads - 1).submit(share) for _ in range(threads - 1)]
-    _THREAD.busy = True
+    # The caller works too: to wake a thread costs as much as some thousand points.
+    others = hand_out(share, threads - 1)
+    set_working(True)
     try:
         share()
     finally:
-        _THREAD.busy = False
+        set_working(False)
         waiting.clear()
-        others = [other for other in others if not other.cancel()]  # one that is still in the queue is not waited for
-        wait(others)
-    for other in others:
-        other.result()
+        errors = [other.finish() for other in others]
+    for error in errors:
+        if error is not None:
+            raise error
     return results
 
 

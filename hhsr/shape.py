@@ -164,7 +164,7 @@ class Shape:
         if bad and not mark:
             require_finite(array, "points")
         result = out.reshape(array.shape[:-1])
-        return scalar(result if mark else result == 1)
+        return scalar(result if mark else result.view(np.bool_))  # then all are 0 or 1
 
     def field(self, points: ArrayLike, on_invalid: OnInvalid = "raise") -> Any:
         """Return (...) the implicit value at points (..., 3): ≤ 0 inside; no distance, and it jumps across step faces.

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import sys
 import threading
+import weakref
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
@@ -12,6 +14,7 @@ import numba
 import pytest
 
 from hhsr.batches import LEAST, in_parts
+from hhsr.workers import hand_out
 
 
 @pytest.fixture(autouse=True)
@@ -69,6 +72,42 @@ def test_batches_of_several_callers_end() -> None:
     with ThreadPoolExecutor(3) as callers:
         found = list(callers.map(all_rows, [1000] * 12))
     assert found == [rows(0, 1000)] * 12
+
+
+def test_a_batch_does_not_wait_for_workers_that_are_not_free() -> None:
+    if numba.get_num_threads() < 2:
+        pytest.skip("one thread has no workers")
+    begun, go_on = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        begun.set()
+        go_on.wait(30)
+
+    assert all_rows(1000) == rows(0, 1000)
+    held = hand_out(hold, numba.get_num_threads() - 1)
+    assert begun.wait(30)
+    try:
+        assert all_rows(1000) == rows(0, 1000)
+        assert not go_on.is_set()
+    finally:
+        go_on.set()
+    assert [task.finish() for task in held] == [None] * len(held)
+
+
+def test_a_worker_that_waits_keeps_no_arrays() -> None:
+    class Rows(list[int]):
+        """A list that can be referred to weakly."""
+
+    held = Rows(rows(0, 1000))
+    alive = weakref.ref(held)
+    in_parts(1000, 10, lambda start, stop, held=held: held[start:stop])  # type: ignore[misc]
+    del held
+    for _ in range(100):  # a task that was taken back is dropped when a worker next looks
+        gc.collect()
+        if alive() is None:
+            break
+        threading.Event().wait(0.05)
+    assert alive() is None
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forking is what Linux does")
