@@ -27,6 +27,7 @@ from hhsr.shape import Shape
 
 Query = Callable[[], Any]
 PASSES = 3  # over the single calls
+ALONE = "ours, one thread"
 
 
 def cases(shape: Shape, count: int, seed: int = 0) -> dict[str, tuple[np.ndarray, ...]]:
@@ -54,6 +55,22 @@ def ours(shape: Shape, given: dict[str, tuple[np.ndarray, ...]]) -> dict[str, Qu
         "signed distance, ±2 mm": lambda: shape.signed_distance(near[: 4 * few]),
         "capsule clearance": lambda: shape.clearance(starts[:few], ends[:few], 1.0),
     }
+
+
+def on_one_thread(queries: dict[str, Query], threads: int) -> dict[str, Query]:
+    """Return the same queries on one thread, asked in the same rounds as on all: phases of the machine fall on both."""
+
+    def alone(query: Query) -> Query:
+        def ask() -> Any:
+            numba.set_num_threads(1)
+            try:
+                return query()
+            finally:
+                numba.set_num_threads(threads)
+
+        return ask
+
+    return {name: alone(query) for name, query in queries.items()}
 
 
 def sizes(given: dict[str, tuple[np.ndarray, ...]]) -> dict[str, int]:
@@ -181,7 +198,7 @@ def main() -> None:
     )
     print(f"{compiled.nbytes / 1e6:.1f} MB; the mesh has {len(surface.faces)} triangles")
     given = cases(shape, arguments.count)
-    cores, alone = os.sched_getaffinity(0), {}
+    cores = os.sched_getaffinity(0)
     for threads in arguments.threads:
         numba.set_num_threads(threads)
         os.sched_setaffinity(0, set(range(threads)) & cores or cores)
@@ -191,16 +208,18 @@ def main() -> None:
                 engines[name] = make(surface.vertices, surface.faces, given, threads)
             except ImportError:
                 print(f"  {name} is not installed: left out")
+        if threads > 1:  # last: right after the others it would find their rows in the caches
+            engines[ALONE] = on_one_thread(engines["ours"], threads)
         least = best_of(engines, arguments.rounds)
         print(f"{threads} thread(s), queries per second:")
         for query, rows in sizes(given).items():
             rates = {name: rows / times[query] for name, times in least.items() if query in times}
+            alone = rates.pop(ALONE, None)
             peers = {name: rate for name, rate in rates.items() if name != "ours" and name not in INEXACT}
             best = max(peers, key=lambda name: peers[name], default="")
             ratio = f"{rates['ours'] / peers[best]:.2f}× {best}" if peers else "no peer"
-            ratio += f"   {rates['ours'] / alone[query]:.2f}× one thread" if query in alone else ""
+            ratio += f"   {rates['ours'] / alone:.2f}× one thread" if alone else ""
             print(f"  {query:26s} " + "  ".join(f"{n} {r / 1e3:9.1f}k" for n, r in rates.items()) + f"   {ratio}")
-        alone = alone or {query: rows / least["ours"][query] for query, rows in sizes(given).items()}
     os.sched_setaffinity(0, cores)
     single_calls(shape, given, arguments.calls)
     if arguments.growth:
