@@ -129,7 +129,7 @@ class Proofs(Records):
         for k in range(len(starts)):
             lobe = lobes_at + slab_at.LOBE_INT_SIZE * k
             spheres = int(ints[lobe + slab_at.LOBE_SPHERES])
-            out = blob[spheres : spheres + 6 * slab_at.TABLE].reshape(slab_at.TABLE, 6)
+            out = blob[spheres : spheres + slab_at.ENCLOSURE * slab_at.TABLE].reshape(slab_at.TABLE, slab_at.ENCLOSURE)
             fill_lobe_spheres(blob_view, ints, slab, lobe, out)
 
     def _reach(self, blob: FloatArray) -> float:
@@ -175,7 +175,7 @@ class Proofs(Records):
         lobes_at, starts = self.slab_records[node]
         for k in range(len(starts)):
             o = int(ints[lobes_at + slab_at.LOBE_INT_SIZE * k + slab_at.LOBE_SPHERES])
-            spheres = blob_view[o : o + 6 * slab_at.TABLE].reshape(-1, 6)
+            spheres = blob_view[o : o + slab_at.ENCLOSURE * slab_at.TABLE].reshape(-1, slab_at.ENCLOSURE)
             spheres = spheres[spheres[:, 5] > 0.0]
             if len(spheres):
                 centres = spheres[:, :3] @ rotation.T + shift

@@ -163,7 +163,7 @@ class Records:
             lobe = [0] * slab_at.LOBE_INT_SIZE
             lobe[slab_at.LOBE_TABLES] = tables
             lobe[slab_at.LOBE_AXES] = parts.add_floats(np.concatenate([arrays.half_axes, np.ones(2)]))
-            lobe[slab_at.LOBE_SPHERES] = parts.add_floats(np.zeros(6 * slab_at.TABLE))
+            lobe[slab_at.LOBE_SPHERES] = parts.add_floats(np.zeros(slab_at.ENCLOSURE * slab_at.TABLE))
             lobe[slab_at.LOBE_SPLINE] = parts.add_floats(arrays.angle)
             lobe[slab_at.LOBE_SEGMENTS] = len(arrays.angle)
             lobe[slab_at.LOBE_CENTRES] = parts.add_floats(arrays.centres)

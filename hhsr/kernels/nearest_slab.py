@@ -9,6 +9,7 @@ from hhsr.kernels.maps import outside_region
 from hhsr.kernels.patch import BEST, FINEST, START, TOLERANCE, VECTOR, distance_to, offer
 from hhsr.kernels.polygon import clip_polygon, polygon_to_segment
 from hhsr.kernels.slab import (
+    ENCLOSURE,
     LOBE_COUNT,
     LOBE_INT_SIZE,
     LOBE_SPHERES,
@@ -182,7 +183,7 @@ def _refine_segment(blob, ints, slab, lobe, segment, planes, count, search, corn
         )
         if low > search[BEST] - search[TOLERANCE]:
             continue
-        o = ints[lobe + LOBE_SPHERES] + 6 * segment
+        o = ints[lobe + LOBE_SPHERES] + ENCLOSURE * segment
         wide, tall = half * blob[o + 5], half_t * d
         if max(wide, tall) < FINEST or depth + 2 > rects.shape[0]:
             continue
@@ -208,7 +209,7 @@ def nearest_on_slab(blob, ints, slab, planes, count, search, corners, spare, rec
         spheres = ints[lobe + LOBE_SPHERES]
         best, at = 1e300, np.int64(0)
         for segment in range(TABLE):
-            o = spheres + 6 * segment
+            o = spheres + ENCLOSURE * segment
             distance, _ = distance_to(search, blob[o], blob[o + 1], blob[o + 2])
             if distance - blob[o + 3] < best:
                 best, at = distance - blob[o + 3], segment
@@ -216,7 +217,7 @@ def nearest_on_slab(blob, ints, slab, planes, count, search, corners, spare, rec
             continue
         _refine_segment(blob, ints, slab, lobe, at, planes, count, search, corners, spare, rects)
         for segment in range(TABLE):
-            o = spheres + 6 * segment
+            o = spheres + ENCLOSURE * segment
             distance, _ = distance_to(search, blob[o], blob[o + 1], blob[o + 2])
             if segment != at and distance - blob[o + 3] <= search[BEST] - search[TOLERANCE]:
                 _refine_segment(blob, ints, slab, lobe, segment, planes, count, search, corners, spare, rects)

@@ -11,11 +11,11 @@ SLAB_FRAME, LOBE_COUNT, LOBES = 0, 1, 2
 SLAB_INT_SIZE = 3
 # Lobe record, integers: float slot of centre 2 and the tables L, R of TABLE + 1 radii (the last repeats the first);
 # the contour's half axes 4 (and two ones, for the bounds), spline coefficients, centres (k, 2), weights, inverse
-# extent; the strip's enclosures, per table segment a sphere 4 and the least and greatest r.
+# extent; the strip's enclosures, per table segment a sphere 4, the least and greatest r, a bound of |C''|.
 LOBE_TABLES, LOBE_AXES, LOBE_SPLINE, LOBE_SEGMENTS, LOBE_CENTRES, LOBE_COUNT_CENTRES = 0, 1, 2, 3, 4, 5
 LOBE_WEIGHTS, LOBE_EXTENT, LOBE_SPHERES = 6, 7, 8
 LOBE_INT_SIZE = 9
-TABLE = 256
+TABLE, ENCLOSURE = 256, 7
 
 
 @unmanaged

@@ -6,6 +6,7 @@ import numpy as np
 
 from hhsr.kernels.segment import PIECES, emit
 from hhsr.kernels.slab import (
+    ENCLOSURE,
     LOBE_COUNT,
     LOBE_INT_SIZE,
     LOBE_SPHERES,
@@ -40,7 +41,7 @@ def _lobe_verdict(blob, ints, lobe, u, v, du, dv, s0, s1, h0, h1):
         low, high = np.inf, 0.0
         q = ints[lobe + LOBE_SPHERES]
         for segment in range(TABLE):
-            low, high = min(low, blob[q + 6 * segment + 4]), max(high, blob[q + 6 * segment + 5])
+            low, high = min(low, blob[q + ENCLOSURE * segment + 4]), max(high, blob[q + ENCLOSURE * segment + 5])
         if near > high:
             return 0
         return 1 if far < low else 2
