@@ -6,8 +6,9 @@
 contains: the voxels' and the maps' answer against the sign of `field`, the formulas alone, on uniform points, points
 within 0.05 mm of the surface and points on cutting planes. crossings: an even count between outside points, on segments
 along axes, through leaf centres and within cutting planes too; between two crossings the state that they claim; on
-segments of at most 2 mm about the surface, and on long ones, the states at steps of 0.002 mm.
-distances: their feet are surface, and no other surface point is nearer. clearances: never above 201 distances.
+segments of at most 2 mm about the surface, and on long ones, the states at steps of 0.002 mm; the first crossing alone
+is the first of all. distances: their feet are surface, and no other surface point is nearer. clearances: never above
+201 distances.
 """
 
 from __future__ import annotations
@@ -104,6 +105,14 @@ def steps_against(shape: hhsr.Shape, starts: np.ndarray, ends: np.ndarray, room:
     return wrong
 
 
+def other_firsts(shape: hhsr.Shape, starts: np.ndarray, ends: np.ndarray, found: hhsr.Crossings) -> int:
+    """Return of how many segments (n, 3) → (n, 3) the first crossing is not the first of all."""
+    some = np.diff(found.offsets) > 0
+    own = np.full(len(starts), np.nan)
+    own[some] = found.t[found.offsets[:-1][some]]
+    return int((~np.isclose(shape.first_crossing(starts, ends), own, rtol=0.0, atol=0.0, equal_nan=True)).sum())
+
+
 def certify(path: str, points: int, segments: int, short: int, long: int, distances: int, seed: int) -> int:
     """Print one line for each query and return how many answers are wrong."""
     shape, rng = hhsr.load(path), np.random.default_rng(seed)
@@ -127,16 +136,19 @@ def certify(path: str, points: int, segments: int, short: int, long: int, distan
     wide = ((found.t[1:] - found.t[:-1])[same] * length > 0.02) & ~inside_plane
     at = (starts[row[1:][same]] + middle[:, None] * (ends - starts)[row[1:][same]])[wide]
     false = int(((shape.field(at) <= 0.0) != found.entering[:-1][same][wide]).sum())
+    others = other_firsts(shape, starts, ends, found)
     print(f"  crossings, {segments} segments, {len(found.t)} crossings: {odd} odd, {false} stretches of a wrong state")
     middle = surface[rng.integers(len(surface), size=short)] + rng.normal(size=(short, 3)) * 0.3
     way = rng.normal(size=(short, 3))
     way *= rng.uniform(0.0, 1.0, (short, 1)) / np.linalg.norm(way, axis=1)[:, None]
     missed = steps_against(shape, middle - way, middle + way)
+    others += other_firsts(shape, middle - way, middle + way, shape.crossings(middle - way, middle + way))
     starts, ends = segments_of(shape, 2 * long, rng)  # the second half lies in cutting planes, in part
     missed_long = steps_against(shape, starts[:long], ends[:long])
     print(
         f"  against steps of {STEP_MM} mm: {missed} of {short} short segments differ, {missed_long} of {long} long ones"
     )
+    print(f"  first crossings, {segments + short} segments: {others} not the first of all")
     # A distance is right if its foot is on the surface, and no other surface point (feet of points near it) is nearer.
     exact = shape.closest_point(surface[rng.integers(len(surface), size=10 * distances)])[0]
     low, high = shape.bounds
@@ -146,7 +158,7 @@ def certify(path: str, points: int, segments: int, short: int, long: int, distan
     nearest, _ = cKDTree(exact).query(some)
     beaten = int((np.abs(distance) > nearest + 0.0101).sum())
     off = foot
-    for ways in (64, 4096):  # a thin wedge is met by few
+    for ways in (64, 4096, 1_000_000):  # a thin wedge is met by few
         around = rng.normal(size=(ways, 3))
         states = shape.contains(off[:, None] + 2e-4 * around / np.linalg.norm(around, axis=1)[:, None])
         off = off[states.all(axis=1) | ~states.any(axis=1)]
@@ -163,7 +175,7 @@ def certify(path: str, points: int, segments: int, short: int, long: int, distan
     step = np.linalg.norm(b - a, axis=1) / 400.0
     optimistic, low_by = int((clear > signed + 1e-9 + 0.01).sum()), int((clear < signed - step - 0.0201).sum())
     print(f"  clearance, {len(a)} segments: {optimistic} optimistic, {low_by} too low")
-    return wrong + odd + false + missed + missed_long + bad + optimistic + low_by
+    return wrong + odd + false + others + missed + missed_long + bad + optimistic + low_by
 
 
 def main() -> None:

@@ -15,14 +15,25 @@ Float32Array = NDArray[np.float32]
 
 CELLS_TOTAL = 144_000  # 36 bytes each, and with its facet and disc some 76
 FINEST = 0.004  # mm: no cell is parted below this thickness
+FACES = 6  # of a leaf's cube of directions
 SHRINKS = 8.0  # halving a cell divides its thickness by about this, while the remainder of the bound rules
 
 
 def fill_leaf_maps(blob: FloatArray, blob_view: FloatArray, owners: list[Owner], parted: bool) -> Float32Array:
     """Prove the maps of the model leaves; return their tables and note in the blob where each lies among them."""
     ints = blob.view(np.int64)
-    bases = in_parts(len(owners), 1, lambda i, j: [_base(blob_view, ints, o) for o in owners[i:j]])
-    proven = [base for part in bases for base in part]
+    proven = [_room(int(ints[owner.record + at.CELLS])) for owner in owners]
+    sides = FACES * len(owners)  # each thread takes some: leaves differ much in size
+
+    def prove(i: int, j: int) -> None:
+        for side in range(i, j):
+            owner = owners[side // FACES]
+            prove_base(
+                blob_view, owner.record, int(ints[owner.record + at.CELLS]), side % FACES, owner.planes_at,
+                len(owner.planes), *proven[side // FACES],
+            )  # fmt: skip
+
+    in_parts(sides, 1, prove)
     thick = [thickness for _, _, thickness, _ in proven]
     level = _levels(thick) if parted else [np.zeros(t.shape, dtype=np.int64) for t in thick]
     tables: list[Float32Array] = []
@@ -41,28 +52,28 @@ def fill_leaf_maps(blob: FloatArray, blob_view: FloatArray, owners: list[Owner],
         place += table.size
 
     def fill(i: int, j: int) -> None:
-        for owner, (models, spans, thickness, _), table in list(zip(owners, proven, tables, strict=True))[i:j]:
+        for side in range(i, j):
+            owner, table = owners[side // FACES], tables[side // FACES]
+            models, spans, thickness, _ = proven[side // FACES]
             record = ints[owner.record : owner.record + at.LEAF_INT_SIZE]
-            n, box, start = int(record[at.CELLS]), int(record[at.BOX]), int(record[at.PARTING])
+            n, start = int(record[at.CELLS]), int(record[at.PARTING])
             words = ints[start : start + thickness.size].reshape(thickness.shape)
             ranges, bends = 2 * pyramid_size(n), at.BEND_SIZE * thickness.size
             cells = table[ranges + bends :].reshape(-1, at.CELL_SIZE)
             bend = table[ranges : ranges + bends].reshape(6, n, n, at.BEND_SIZE)
-            prove_cells(blob_view, owner.record, n, words, models, spans, cells, bend)
-            fill_ranges(n, spans, table[:ranges].reshape(-1, 2), blob[box : box + 8])
+            prove_cells(blob_view, owner.record, n, side % FACES, words, models, spans, cells, bend)
 
-    in_parts(len(owners), 1, fill)
+    in_parts(sides, 1, fill)
+    for owner, (_, spans, _, _), table in zip(owners, proven, tables, strict=True):
+        n, box = (int(x) for x in ints[owner.record + np.array([at.CELLS, at.BOX])])
+        fill_ranges(n, spans, table[: 2 * pyramid_size(n)].reshape(-1, 2), blob[box : box + 8])
     return np.concatenate(tables) if tables else np.empty(0, dtype=np.float32)
 
 
-def _base(
-    blob_view: FloatArray, ints: NDArray[np.int64], owner: Owner
-) -> tuple[Float32Array, FloatArray, FloatArray, Float32Array]:
-    n = int(ints[owner.record + at.CELLS])
+def _room(n: int) -> tuple[Float32Array, FloatArray, FloatArray, Float32Array]:
+    """Return room for the models, spans, thickness and bends of a leaf's base cells."""
     models, spans = np.empty((6, n, n, at.CELL_SIZE), dtype=np.float32), np.empty((6, n, n, 2))
-    thickness, bends = np.empty((6, n, n)), np.empty((6, n, n, at.BEND_SIZE), dtype=np.float32)
-    prove_base(blob_view, owner.record, n, owner.planes_at, len(owner.planes), models, spans, thickness, bends)
-    return models, spans, thickness, bends
+    return models, spans, np.empty((6, n, n)), np.empty((6, n, n, at.BEND_SIZE), dtype=np.float32)
 
 
 def _levels(thickness: list[FloatArray]) -> list[NDArray[np.int64]]:

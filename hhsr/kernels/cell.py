@@ -7,6 +7,7 @@ stay straight and the surface is a height field (DESIGN §4).
 
 import math
 
+from hhsr.kernels.cell_bends import rectangle_bends
 from hhsr.kernels.field_sums import field_at
 from hhsr.kernels.interval import product, widened
 from hhsr.kernels.layout import (
@@ -97,11 +98,17 @@ def scale_in_block(blob, ints, leaf, block, ux, uy, uz):
 
 
 @unmanaged
+def is_ellipsoid(ints, leaf):
+    """Return whether a leaf's base has no exponents."""
+    return ints[leaf + AZIMUTH_COUNT] == 0 and ints[leaf + ELEVATION_COUNT] == 0
+
+
+@unmanaged
 def norm_at(blob, ints, leaf, x, y, z):
     """Return the superquadric's norm N of a leaf at (x, y, z)."""
     n, m = ints[leaf + AZIMUTH_COUNT], ints[leaf + ELEVATION_COUNT]
     h, s, e = ints[leaf + HALF_AXES], ints[leaf + AZIMUTH], ints[leaf + ELEVATION]
-    if n == 0 and m == 0:
+    if is_ellipsoid(ints, leaf):
         sx = x / blob[h] if x >= 0.0 else -x / blob[h + 1]
         sy = y / blob[h + 2] if y >= 0.0 else -y / blob[h + 3]
         sz = z / blob[h + 4] if z >= 0.0 else -z / blob[h + 5]
@@ -139,15 +146,16 @@ def axis_scale(blob, half_axes, axis, sign):
 
 
 @unmanaged
-def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
+def cell_model(blob, ints, leaf, face, a, b, half_a, half_b, by_ranges):
     """Return (value, slope_a, slope_b, error, spread_a, spread_b, lo, hi, bend_lo, bend_hi, kink, third, aa, ab, bb).
 
     |W − value − slope·δ| ≤ error, |∂W − slope| ≤ spread, lo ≤ W ≤ hi, the eigenvalues of ∂²W lie in [bend_lo, bend_hi],
-    and ∂²W differs from that at the centre by no more than kink + r·third at r from it (infinite where the base is no
-    ellipsoid or the field may be capped): all proven on the whole rectangle about (a, b).
+    and ∂²W differs from that at the centre by no more than kink + r·third at r from it (infinite where the field may be
+    capped, or second derivatives are): all proven on the whole rectangle about (a, b).
     `value` is the middle of that strip, not W at the centre. (aa, ab, bb): ∂²W at the centre; then the slope is ∂W
     there, and value W + (aa·half_a² + bb·half_b²)/4. NaN where it is not. The rectangle must lie within one block of
-    directions and straddle no coordinate plane.
+    directions and straddle no coordinate plane. by_ranges: second derivatives also where the base is no ellipsoid, in
+    three times the time.
     """
     bend_lo, bend_hi, kink, third = -math.inf, math.inf, math.inf, math.inf
     bend_aa = bend_ab = bend_bb = math.nan
@@ -208,6 +216,7 @@ def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
     slope_a, slope_b = 0.5 * (wa_lo + wa_hi), 0.5 * (wb_lo + wb_hi)
     spread_a, spread_b = 0.5 * (wa_hi - wa_lo), 0.5 * (wb_hi - wb_lo)
     error = (spread_a * half_a + spread_b * half_b) * (1.0 + 1e-11) + 1e-11 * abs(value)
+    r = math.sqrt(half_a * half_a + half_b * half_b)
     if smooth:
         # An ellipsoid: N_ij = (A_i² δ_ij − N_i N_j)/N, and Taylor to third order, with D_i = D² s_i.
         if face < 2:
@@ -224,7 +233,6 @@ def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
         bb = d * ((scale_b - nb * nb) / norm + d * (2.0 * nb * sb + norm * (sbb + 2.0 * d * sb * sb)))
         ab = d * (-na * nb / norm + d * (na * sb + nb * sa + norm * (sab + 2.0 * d * sa * sb)))
         # Beyond the Hessian: the third derivative, and the kinks where supports end.
-        r = math.sqrt(half_a * half_a + half_b * half_b)
         s1 = math.sqrt(max(-sa_lo, sa_hi) ** 2 + max(-sb_lo, sb_hi) ** 2)
         s2 = max(abs(saa), abs(sbb)) + abs(sab) + rest2 + r * rest3
         n1 = math.sqrt(max(-na_lo, na_hi) ** 2 + max(-nb_lo, nb_hi) ** 2)
@@ -233,6 +241,15 @@ def cell_model(blob, ints, leaf, face, a, b, half_a, half_b):
             norm, na, nb, scale_a, scale_b, d, sa, sb, saa, sab, sbb, saaa, saab, sabb, sbbb,
             n_lo, n_hi, n1, max(scale_a, scale_b) / n_lo, d_hi, s1, s2, rest2, rest3, border3, rest4, r,
         )  # fmt: skip
+    elif by_ranges and p + q > 0 and s_hi < MAX_SCALE and (face < 4 or a0 + b0 > 0.0):
+        rest = rest2 + r * rest3
+        exact_a, exact_b, aa, ab, bb, kink = rectangle_bends(
+            blob, ints, leaf, face, (a, b, half_a, half_b), (x0, x1), (y0, y1), (z0, z1), sx, sy, sz, norm,
+            (s, sa, sb, saa, sab, sbb, rest), (sa_lo, sa_hi), (sb_lo, sb_hi), (d_lo, d_hi), (w_lo, w_hi),
+            (wa_lo, wa_hi), (wb_lo, wb_hi),
+        )  # fmt: skip
+        third = 0.0 if kink < math.inf else math.inf
+    if third < math.inf:
         rise = r * third
         middle, wide = 0.5 * (aa + bb), math.sqrt(0.25 * (aa - bb) ** 2 + ab * ab)
         bend_lo = middle - wide - (kink + rise) * (1.0 + 1e-9) - 1e-9 * abs(value)

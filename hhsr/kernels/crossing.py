@@ -10,7 +10,7 @@ from numba import njit
 
 from hhsr.kernels.cell_along import CELL_ROWS
 from hhsr.kernels.clipped import follow_tree, merge_touches
-from hhsr.kernels.lane import BEGIN, FIRST_RUN, GAP, LAST_RUN, MERGE, ROWS, RUNS_USED, SPILLED, set_out
+from hhsr.kernels.lane import BEGIN, FIRST_RUN, FOUND, GAP, LAST_RUN, MERGE, ROWS, RUNS_USED, SPILLED, set_out
 from hhsr.kernels.layout import VOXELS, integers, tables
 from hhsr.kernels.runs import HALVINGS, RUN_SIZE
 from hhsr.kernels.segment import PIECES, emit
@@ -24,6 +24,7 @@ from hhsr.kernels.walk import go_on
 SLOTS = 64  # pending tree nodes of one segment: three a level
 RUNS = 64  # of one segment, before they are settled
 LANE_ROWS = PIECES + ROWS
+TOUCH = -2
 
 
 @njit(cache=True, error_model="numpy")
@@ -41,7 +42,10 @@ def scratch():
 def _walk(
     blob, ints, tab, px, py, pz, ex, ey, ez, length, resolution, tolerance, first, out, work, slots, pending
 ):  # fmt: skip
-    """Return (start state, count) of a segment of some length by the walk of the voxels; count −1: too many runs."""
+    """Return (start state, count) of a segment of some length by the walk of the voxels.
+
+    count −1: too many runs; TOUCH: the first that it found was a touch, which is none, and there it ended.
+    """
     lanes, rows = work[PIECES:LANE_ROWS], work[LANE_ROWS : LANE_ROWS + CELL_ROWS]
     runs = work[LANE_ROWS + CELL_ROWS :].reshape(RUNS + HALVINGS, RUN_SIZE)
     if not set_out(blob, ints, lanes, 0, px, py, pz, ex, ey, ez, length):
@@ -58,7 +62,9 @@ def _walk(
                 slots, pending, rows,
             )  # fmt: skip
         lanes[RUNS_USED, 0], lanes[FIRST_RUN, 0], lanes[LAST_RUN, 0] = 0.0, -1.0, -1.0
-    return lanes[BEGIN, 0] > 0.0, min(count, np.int64(1)) if first else count
+    if first:
+        count = min(count, np.int64(1)) if count > 0 or lanes[FOUND, 0] == np.inf else np.int64(TOUCH)
+    return lanes[BEGIN, 0] > 0.0, count
 
 
 @unmanaged
@@ -80,8 +86,13 @@ def follow_segment(
         begin, count = _walk(
             blob, ints, tab, px, py, pz, ex, ey, ez, length, resolution, tolerance, first, out, work, slots, pending
         )
+        if count == TOUCH:
+            begin, count = _walk(
+                blob, ints, tab, px, py, pz, ex, ey, ez, length, resolution, tolerance, np.bool_(False), out, work,
+                slots, pending,
+            )  # fmt: skip
         if count >= 0:
-            return begin, count
+            return begin, min(count, np.int64(1)) if first else count
     begin = solid_contains(blob, ints, tab, root, px, py, pz)
     state, count, done = follow_tree(
         blob, ints, tab, root, px, py, pz, dx, dy, dz, 0.0, 1.0, gap, resolution, tolerance, first, begin, out,

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from hhsr.kernels.cell import direction_of, face_of, inverse_radius
-from hhsr.kernels.jet import has_jets, inverse_radius_bend
+from hhsr.kernels.jet import inverse_radius_bend
 from hhsr.kernels.layout import (
     FRAME,
     MODEL,
@@ -46,7 +46,7 @@ def descend(blob, ints, tab, owner, face, a, b, slides, search):
     for _ in range(STEPS):
         o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
         leaf = ints[o + OWNER_RECORD]
-        if ints[o + OWNER_KIND] != MODEL or not has_jets(ints, leaf):
+        if ints[o + OWNER_KIND] != MODEL:
             return False
         planes, count = ints[o + OWNER_PLANE_FLOATS], ints[o + OWNER_PLANES]
         frame = ints[leaf + FRAME]

@@ -96,7 +96,7 @@ def list_facets(blob, owner, leaf, planes, count, codes, discs):
             o, face, a, b, half = facet_cell(ints, leaf, code)
             value, ga, gb, error = tab[o + VALUE], tab[o + SLOPE_A], tab[o + SLOPE_B], tab[o + ERROR]
             if not quad_radius_ok(value, ga, gb, error, half, half):
-                lo, hi = cell_model(blob, ints, leaf, face, a, b, half, half)[6:8]
+                lo, hi = cell_model(blob, ints, leaf, face, a, b, half, half, np.bool_(False))[6:8]
                 x, y, z, radius = cell_sphere(face, a, b, half, half, value, ga, gb, error, lo, hi)
                 if not outside_region(blob, planes, count, x, y, z, radius):
                     _put_disc(discs[found], frame, x, y, z, 0.0, 0.0, 1.0, radius, radius)

@@ -1,5 +1,7 @@
 """A cell without a bend, against a point or a segment: bounded by its flat quad, settled by parting it."""
 
+import numpy as np
+
 from hhsr.kernels.cell import cell_model, direction_of
 from hhsr.kernels.maps import outside_region
 from hhsr.kernels.patch import BEST, FINEST, TOLERANCE, cell_bound, distance_to, offer
@@ -20,7 +22,7 @@ def refine_cell(blob, ints, leaf, planes, count, search, face, a, b, half, corne
         base = depth
         for corner in range(4):
             ca, cb = a + (half if corner & 1 else -half), b + (half if corner & 2 else -half)
-            value, ga, gb, error = cell_model(blob, ints, leaf, face, ca, cb, half, half)[:4]
+            value, ga, gb, error = cell_model(blob, ints, leaf, face, ca, cb, half, half, np.bool_(False))[:4]
             low = cell_bound(
                 blob, ints, leaf, planes, count, search, face, ca, cb, half, value, ga, gb, error, corners, spare
             )

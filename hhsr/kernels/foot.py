@@ -11,7 +11,7 @@ import numpy as np
 
 from hhsr.kernels.box_state import directions_of
 from hhsr.kernels.cell import axis_scale, chart_of, direction_of, face_of
-from hhsr.kernels.jet import has_jets, inverse_radius_bend, inverse_radius_jet
+from hhsr.kernels.jet import inverse_radius_bend, inverse_radius_jet
 from hhsr.kernels.layout import (
     CELLS,
     HALF_AXES,
@@ -178,7 +178,7 @@ def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, local, spare):
     """
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
     leaf = ints[o + OWNER_RECORD]
-    if ints[o + OWNER_KIND] != MODEL or not has_jets(ints, leaf) or (px == 0.0 and py == 0.0 and pz == 0.0):
+    if ints[o + OWNER_KIND] != MODEL or (px == 0.0 and py == 0.0 and pz == 0.0):
         return np.inf, UNPROVEN
     face, a, b, m = face_of(px, py, pz)
     found, ca, cb, w, wa, wb = _descend(blob, ints, tab, leaf, face, a, b, m, px, py, pz, tolerance)
@@ -211,7 +211,7 @@ def foot_in_chart(blob, ints, tab, owner, px, py, pz, tolerance, local, spare):
 @unmanaged
 def leaf_is_free(blob, ints, tab, leaf, px, py, pz, radius, tolerance, local, spare):
     """Return whether no surface of a leaf, in its region or beyond, is nearer than `radius` to a point of its frame."""
-    if not has_jets(ints, leaf) or (px == 0.0 and py == 0.0 and pz == 0.0):
+    if px == 0.0 and py == 0.0 and pz == 0.0:
         return False
     face, a, b, m = face_of(px, py, pz)
     found, ca, cb, w, wa, wb = _descend(blob, ints, tab, leaf, face, a, b, m, px, py, pz, tolerance)

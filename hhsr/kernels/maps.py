@@ -256,8 +256,8 @@ def _put_bend(bends, face, i, j, bend_lo, bend_hi):
 
 
 @entry
-def prove_base(blob, leaf, n, planes, count, models, spans, thickness, bends):
-    """Prove the base cells of a leaf.
+def prove_base(blob, leaf, n, face, planes, count, models, spans, thickness, bends):
+    """Prove the base cells of one face of a leaf.
 
     models: (6, n, n, CELL_SIZE) float32. spans: (6, n, n, 2) range of W. thickness: (6, n, n) mm, how far surface and
     plane can lie apart in the thickest of a cell's four quarters; 0 where the surface lies outside the leaf's region,
@@ -265,71 +265,69 @@ def prove_base(blob, leaf, n, planes, count, models, spans, thickness, bends):
     """
     ints = integers(blob)
     half = 1.0 / n
-    for face in range(6):
-        for i in range(n):
-            for j in range(n):
-                a, b = (2 * i + 1) * half - 1.0, (2 * j + 1) * half - 1.0
-                value, ga, gb, error, da, db, lo, hi, b0, b1, kink, third, aa, ab, bb = cell_model(
-                    blob, ints, leaf, face, a, b, half, half
-                )
-                _put_bend(bends, face, i, j, b0, b1)
-                _write(models[face, i, j], value, ga, gb, error, half, da, db, kink, third, aa, ab, bb)
-                spans[face, i, j, 0], spans[face, i, j, 1] = lo, hi
-                x, y, z, radius = cell_sphere(face, a, b, half, half, value, ga, gb, error, lo, hi)
+    for i in range(n):
+        for j in range(n):
+            a, b = (2 * i + 1) * half - 1.0, (2 * j + 1) * half - 1.0
+            value, ga, gb, error, da, db, lo, hi, b0, b1, kink, third, aa, ab, bb = cell_model(
+                blob, ints, leaf, face, a, b, half, half, np.bool_(False)
+            )
+            _put_bend(bends, face, i, j, b0, b1)
+            _write(models[face, i, j], value, ga, gb, error, half, da, db, kink, third, aa, ab, bb)
+            spans[face, i, j, 0], spans[face, i, j, 1] = lo, hi
+            x, y, z, radius = cell_sphere(face, a, b, half, half, value, ga, gb, error, lo, hi)
+            if outside_region(blob, planes, count, x, y, z, radius):
+                thickness[face, i, j] = 0.0
+                continue
+            worst = 0.0
+            for q in range(4):
+                ca, cb = a + (0.5 * half if q & 1 else -0.5 * half), b + (0.5 * half if q & 2 else -0.5 * half)
+                value, ga, gb, error, _, _, lo, hi = cell_model(
+                    blob, ints, leaf, face, ca, cb, 0.5 * half, 0.5 * half, np.bool_(False)
+                )[:8]
+                x, y, z, radius = cell_sphere(face, ca, cb, 0.5 * half, 0.5 * half, value, ga, gb, error, lo, hi)
                 if outside_region(blob, planes, count, x, y, z, radius):
-                    thickness[face, i, j] = 0.0
                     continue
-                worst = 0.0
-                for q in range(4):
-                    ca, cb = a + (0.5 * half if q & 1 else -0.5 * half), b + (0.5 * half if q & 2 else -0.5 * half)
-                    value, ga, gb, error, _, _, lo, hi = cell_model(
-                        blob, ints, leaf, face, ca, cb, 0.5 * half, 0.5 * half
-                    )[:8]
-                    x, y, z, radius = cell_sphere(face, ca, cb, 0.5 * half, 0.5 * half, value, ga, gb, error, lo, hi)
-                    if outside_region(blob, planes, count, x, y, z, radius):
-                        continue
-                    if quad_radius_ok(value, ga, gb, error, 0.5 * half, 0.5 * half):
-                        thick = model_thickness(face, ca, cb, 0.5 * half, 0.5 * half, value, ga, gb, error)
-                        worst = max(worst, min(thick, STEEP))
-                    else:
-                        worst = STEEP
-                thickness[face, i, j] = worst
+                if quad_radius_ok(value, ga, gb, error, 0.5 * half, 0.5 * half):
+                    thick = model_thickness(face, ca, cb, 0.5 * half, 0.5 * half, value, ga, gb, error)
+                    worst = max(worst, min(thick, STEEP))
+                else:
+                    worst = STEEP
+            thickness[face, i, j] = worst
 
 
 @entry
-def prove_cells(blob, leaf, n, parting, models, spans, cells, bends):
-    """Prove the cells of every parted base cell, and narrow its span by theirs.
+def prove_cells(blob, leaf, n, face, parting, models, spans, cells, bends):
+    """Prove the cells of every parted base cell of one face, and narrow its span by theirs.
 
     parting: (6, n, n) words (`hhsr.kernels.layout`). models: of the base cells, used as they are where k = 0. cells:
     (…, CELL_SIZE) float32. bends: (6, n, n, 2) float32, the bend of each base cell, narrowed by theirs.
     """
     ints = integers(blob)
-    for face in range(6):
-        for i in range(n):
-            for j in range(n):
-                first, k = parting[face, i, j] >> 4, parting[face, i, j] & 7
-                if k == 0:
-                    for q in range(CELL_SIZE):
-                        cells[first, q] = models[face, i, j, q]
-                    continue
-                s = 1 << k
-                half = 1.0 / (n * s)
-                low, high = 1e300, 0.0
-                bend_lo, bend_hi = np.inf, -np.inf
-                for p in range(s):
-                    for q in range(s):
-                        a, b = (2 * (i * s + p) + 1) * half - 1.0, (2 * (j * s + q) + 1) * half - 1.0
-                        value, ga, gb, error, da, db, lo, hi, b0, b1, kink, third, aa, ab, bb = cell_model(
-                            blob, ints, leaf, face, a, b, half, half
-                        )
-                        _write(cells[first + p * s + q], value, ga, gb, error, half, da, db, kink, third, aa, ab, bb)
-                        low, high = min(low, lo), max(high, hi)
-                        bend_lo, bend_hi = min(bend_lo, b0), max(bend_hi, b1)
-                _put_bend(bends, face, i, j, bend_lo, bend_hi)
-                spans[face, i, j, 0], spans[face, i, j, 1] = (
-                    max(spans[face, i, j, 0], low),
-                    min(spans[face, i, j, 1], high),
-                )
+    for i in range(n):
+        for j in range(n):
+            first, k = parting[face, i, j] >> 4, parting[face, i, j] & 7
+            if k == 0:
+                for q in range(CELL_SIZE):
+                    cells[first, q] = models[face, i, j, q]
+                continue
+            s = 1 << k
+            half = 1.0 / (n * s)
+            low, high = 1e300, 0.0
+            bend_lo, bend_hi = np.inf, -np.inf
+            for p in range(s):
+                for q in range(s):
+                    a, b = (2 * (i * s + p) + 1) * half - 1.0, (2 * (j * s + q) + 1) * half - 1.0
+                    value, ga, gb, error, da, db, lo, hi, b0, b1, kink, third, aa, ab, bb = cell_model(
+                        blob, ints, leaf, face, a, b, half, half, np.bool_(True)
+                    )
+                    _write(cells[first + p * s + q], value, ga, gb, error, half, da, db, kink, third, aa, ab, bb)
+                    low, high = min(low, lo), max(high, hi)
+                    bend_lo, bend_hi = min(bend_lo, b0), max(bend_hi, b1)
+            _put_bend(bends, face, i, j, bend_lo, bend_hi)
+            spans[face, i, j, 0], spans[face, i, j, 1] = (
+                max(spans[face, i, j, 0], low),
+                min(spans[face, i, j, 1], high),
+            )
 
 
 @entry

@@ -16,7 +16,7 @@ LN2 = math.log(2.0)
 
 
 @unmanaged
-def _cubic_range(c0, c1, c2, c3, x0, x1):
+def cubic_range(c0, c1, c2, c3, x0, x1):
     """Return the range of a cubic on [x0, x1]: its ends and its extremes between them."""
     f0 = c0 + x0 * (c1 + x0 * (c2 + x0 * c3))
     f1 = c0 + x1 * (c1 + x1 * (c2 + x1 * c3))
@@ -48,9 +48,9 @@ def exponent_range(coefficients, share0, share1):
         x1 = min(share1 * n - segment + 1e-9, 1.0 + 1e-9)
         c0, c1 = coefficients[segment, 0], coefficients[segment, 1]
         c2, c3 = coefficients[segment, 2], coefficients[segment, 3]
-        lo, hi = _cubic_range(c0, c1, c2, c3, x0, x1)
+        lo, hi = cubic_range(c0, c1, c2, c3, x0, x1)
         s_lo, s_hi = min(s_lo, lo), max(s_hi, hi)
-        lo, hi = _cubic_range(c1, 2.0 * c2, 3.0 * c3, 0.0, x0, x1)
+        lo, hi = cubic_range(c1, 2.0 * c2, 3.0 * c3, 0.0, x0, x1)
         d_lo, d_hi = min(d_lo, lo), max(d_hi, hi)
     g_lo, g_hi = math.tanh(0.5 * s_lo), math.tanh(0.5 * s_hi)
     k0, k1 = 1.0 - g_lo * g_lo, 1.0 - g_hi * g_hi

@@ -36,7 +36,9 @@ def _add_steep(blob, ints, leaf, planes, count, face, a, b, half, rotation, box)
     for i in range(16):
         for j in range(16):
             ca, cb = a - half + (2 * i + 1) * part, b - half + (2 * j + 1) * part
-            value, ga, gb, error, _, _, lo, hi = cell_model(blob, ints, leaf, face, ca, cb, part, part)[:8]
+            value, ga, gb, error, _, _, lo, hi = cell_model(
+                blob, ints, leaf, face, ca, cb, part, part, np.bool_(False)
+            )[:8]
             x, y, z, radius = cell_sphere(face, ca, cb, part, part, value, ga, gb, error, lo, hi)
             if not outside_region(blob, planes, count, x, y, z, radius):
                 _add(box, rotation, x, y, z, radius)

@@ -207,21 +207,24 @@ def gather_crossings(answers, found, first, run, count, gap, ts, used):
     """Put the crossings of a segment, whose runs from `run` on are settled, into ts from `used` on; none: −1.
 
     Returns its count, from what the walk counted on, and how many slots of ts are used then. A leaving and an entering
-    no more than `gap` apart are dropped.
+    no more than `gap` apart are dropped. MANY: or where the walk ended at the first, and that is dropped.
     """
-    base = used
+    base, dropped = used, False
     while run >= 0 and count >= 0:
         if answers[run, ANSWER_COUNT] < 0:
             return np.int64(MANY), base
         place = answers[run, ANSWER_PLACE]
         for k in range(place, place + answers[run, ANSWER_COUNT]):
             if used > base and found[k] - ts[used - 1] <= gap:
-                used -= 1
+                used, dropped = used - 1, True
             else:
                 ts[used] = found[k]
                 used += 1
         run = np.int64(answers[run, ANSWER_NEXT])
     if count < 0:
         return count, base
-    used = min(used, base + 1) if first else used
+    if first:
+        if dropped and used == base:
+            return np.int64(MANY), base
+        used = min(used, base + 1)
     return np.int64(used - base), used

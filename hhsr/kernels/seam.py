@@ -6,7 +6,7 @@ Nothing is proven by it: where it ends the surface point is an upper bound.
 import math
 
 from hhsr.kernels.cell import direction_of, face_of
-from hhsr.kernels.jet import has_jets, inverse_radius_jet
+from hhsr.kernels.jet import inverse_radius_jet
 from hhsr.kernels.layout import (
     FRAME,
     MODEL,
@@ -88,7 +88,7 @@ def slide_from(blob, ints, x, y, z, search):
     owner = owner_of(blob, ints, 0, x, y, z)
     o = ints[OWNER_INTS] + OWNER_INT_SIZE * owner
     leaf = ints[o + OWNER_RECORD]
-    if ints[o + OWNER_KIND] != MODEL or not has_jets(ints, leaf):
+    if ints[o + OWNER_KIND] != MODEL:
         return False
     planes = ints[o + OWNER_PLANE_FLOATS]
     x, y, z = into_leaf(blob, ints, leaf, x, y, z)

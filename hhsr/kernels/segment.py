@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from hhsr.kernels.cell import cell_model, chart_of, inverse_radius
-from hhsr.kernels.jet import has_jets, inverse_radius_jet
+from hhsr.kernels.jet import inverse_radius_jet
 from hhsr.kernels.layout import (
     BOX,
     CELLS,
@@ -206,7 +206,7 @@ def face_crossings(
             half_a, half_b = 0.5 * abs(a1 - a0) + 1e-12, 0.5 * abs(b1 - b0) + 1e-12
             value = ga = gb = 0.0
             bend_lo, bend_hi = bend_over(tab, ints, leaf, face, i0, i1, j0, j1)
-            if bend_hi - bend_lo < math.inf and has_jets(ints, leaf):
+            if bend_hi - bend_lo < math.inf:
                 value, ga, gb = inverse_radius_jet(blob, ints, leaf, face, a, b)
             if value > 0.0:
                 # The exact jet at the middle, and how far its bend lets W stray from it on the piece.
@@ -234,7 +234,9 @@ def face_crossings(
                         False, speed, resolution, tolerance, state, out, count,
                     )  # fmt: skip
                     if verdict == UNDECIDED:
-                        value, ga, gb, error, sa, sb = cell_model(blob, ints, leaf, face, a, b, half_a, half_b)[:6]
+                        value, ga, gb, error, sa, sb = cell_model(
+                            blob, ints, leaf, face, a, b, half_a, half_b, np.bool_(False)
+                        )[:6]
                         verdict, state, count = _settle(
                             blob, ints, leaf, face, t0, a0, b0, w0, t1, a1, b1, w1,
                             a, b, value, ga, gb, error, sa, sb, True, speed, resolution, tolerance, state, out, count,

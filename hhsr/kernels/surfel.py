@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from hhsr.kernels.box_state import IN, MIXED, OUT, SLACK, directions_of, leaf_box_state
+from hhsr.kernels.cell import is_ellipsoid
 from hhsr.kernels.layout import (
     BEND_SIZE,
     BEND_TABLE,
@@ -148,7 +149,9 @@ def prove_plane(ints, tab, leaf, q, e, acc, out):
     out[NORMAL], out[NORMAL + 1], out[NORMAL + 2] = gx, gy, gz
     out[OFFSET] = gx * q[0] + gy * q[1] + gz * q[2] + 0.5 * (low + high) - 1.0
     thick = 0.5 * (high - low) * (1.0 + 1e-9) + 2e-9
-    out[DETAIL + THICK], out[DETAIL + TURN], out[DETAIL + BEND] = thick, turn * (1.0 + 1e-9), bend
+    out[DETAIL + THICK], out[DETAIL + TURN] = thick, turn * (1.0 + 1e-9)
+    # Runs of a known bend are settled by the formulas of an ellipsoid (`hhsr.kernels.cell_along`).
+    out[DETAIL + BEND] = bend if is_ellipsoid(ints, leaf) else np.inf
     return True
 
 

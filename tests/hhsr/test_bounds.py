@@ -83,7 +83,7 @@ def test_models_of_any_rectangle_hold(half: float) -> None:
         blob = compile_tree(Tree(leaf, frozen(np.zeros(6)))).blob
         ints = integers(blob)
         record = ints[ints[at.OWNER_INTS] + at.OWNER_RECORD]
-        for _ in range(40):
+        for k in range(40):
             face = int(rng.integers(6))
             block = rng.integers(8, size=2)
             ca, cb = (
@@ -91,7 +91,10 @@ def test_models_of_any_rectangle_hold(half: float) -> None:
                 if half > 0.05
                 else -1 + (block + rng.uniform(0.1, 0.9, 2)) / 4
             )
-            value, ga, gb, error, _, _, low, high = cell_model(blob, ints, record, face, ca, cb, half, half)[:8]
+            by_ranges = np.bool_(k % 2 == 0)
+            value, ga, gb, error, _, _, low, high = cell_model(blob, ints, record, face, ca, cb, half, half, by_ranges)[
+                :8
+            ]
             da, db = half * rng.uniform(-1, 1, (2, 30))
             directions = np.array([direction_of(face, ca + x, cb + y) for x, y in zip(da, db, strict=True)])
             exact = inverse_radii(leaf, directions)

@@ -13,6 +13,7 @@ from hhsr.kernels.crossing import scratch
 from hhsr.kernels.lane import BEGIN, FIRST_RUN, MERGE, ROWS, RUNS_USED, set_out
 from hhsr.kernels.layout import integers, tables
 from hhsr.kernels.run_batch import (
+    MANY,
     ROOM,
     gather_crossings,
     most_keys,
@@ -21,7 +22,7 @@ from hhsr.kernels.run_batch import (
     settle_others,
     settle_smooth,
 )
-from hhsr.kernels.runs import ANSWER_SIZE, RUN_SIZE
+from hhsr.kernels.runs import ANSWER_COUNT, ANSWER_NEXT, ANSWER_PLACE, ANSWER_SIZE, RUN_SIZE
 from hhsr.kernels.segment import PIECES
 from hhsr.kernels.tree import into_tree
 from hhsr.kernels.vectors import LANES
@@ -68,3 +69,17 @@ def test_many_segments_have_the_crossings_of_each(name: str) -> None:
         assert count == last == len(alone.t)
         assert np.allclose(ts[:count], alone.t, rtol=0, atol=1e-12)
         assert inside[i] == shape.contains(starts[i])
+
+
+def test_a_first_crossing_that_is_a_touch_sends_for_the_others() -> None:
+    """The walk for a first crossing ends behind it: where that is a touch after all, the segment is followed alone."""
+    answers, found, ts = np.zeros((2, ANSWER_SIZE), dtype=np.int32), np.array([0.25, 0.25, 0.75]), np.zeros(4)
+    answers[0, [ANSWER_COUNT, ANSWER_PLACE, ANSWER_NEXT]] = 1, 0, 1
+    answers[1, [ANSWER_COUNT, ANSWER_PLACE, ANSWER_NEXT]] = 1, 1, -1
+    first = gather_crossings(answers, found, np.bool_(True), np.int64(0), np.int64(0), 1e-9, ts, np.int64(1))
+    assert first == (MANY, 1)
+    assert gather_crossings(answers, found, np.bool_(False), np.int64(0), np.int64(0), 1e-9, ts, np.int64(1)) == (0, 1)
+    answers[1, ANSWER_COUNT] = 2
+    first = gather_crossings(answers, found, np.bool_(True), np.int64(0), np.int64(0), 1e-9, ts, np.int64(1))
+    assert first == (1, 2)
+    assert ts[1] == 0.75
