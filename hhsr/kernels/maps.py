@@ -89,6 +89,8 @@ def jet_near(tab, ints, leaf, face, a, b):
     """Return (W, W_a, W_b, W_aa, W_ab, W_bb, error) at (a, b) by the table, the error a bound of W's; NaN: unknown."""
     o, ca, cb, half = cell_at(ints, leaf, face, a, b)
     w, wa, wb, aa, ab, bb = jet_of(tab, o, half)
+    if not w > 0.0:
+        return w, wa, wb, aa, ab, bb, math.inf
     da, db = a - ca, b - cb
     ra, rb = aa * da + ab * db, ab * da + bb * db
     away2 = da * da + db * db

@@ -83,8 +83,8 @@ def _shrunk(t, w, d, k, a):
 @unmanaged
 def p_norm_bends(x, y, k):
     """Return the ranges (M, M_x, M_y, M_k, M_xx, M_xy, M_yy, M_xk, M_yk, M_kk) over x, y ≥ 0, not both 0, and k > 1."""
-    d0 = math.log(y[0] / x[1]) if y[0] > 0.0 else -math.inf
-    d1 = math.log(y[1] / x[0]) if x[0] > 0.0 else math.inf
+    d0 = (math.log(y[0] / x[1]) if x[1] > 0.0 else math.inf) if y[0] > 0.0 else -math.inf
+    d1 = (math.log(y[1] / x[0]) if y[1] > 0.0 else -math.inf) if x[0] > 0.0 else math.inf
     t = (d0 * (k[0] if d0 > 0.0 else k[1]), d1 * (k[1] if d1 > 0.0 else k[0]))
     w0, v1, h0, s0 = _of_logit(t[0])
     w1, v0, h1, s1 = _of_logit(t[1]) if t[1] > t[0] else (w0, v1, h0, s0)

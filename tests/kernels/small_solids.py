@@ -147,10 +147,15 @@ def solid(name: str) -> Shape:
 
     What is proven holds for maps of any size; coarse ones leave more to the searches.
     """
+    return coarse(TREES[name]())
+
+
+def coarse(tree: Tree) -> Shape:
+    """Return a tree's shape, compiled with coarse maps and voxels."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(records, "BASE_SIDE", 16)
         patch.setattr(leaf_maps, "CELLS_TOTAL", 3000)
         patch.setattr(proofs, "VOXELS_TOTAL", 600)
-        shape = Shape(TREES[name]())
+        shape = Shape(tree)
         assert shape.compiled.nbytes > 0
     return shape

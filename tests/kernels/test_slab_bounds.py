@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
 
-from hhsr.compiled import Compiled, compile_tree
+from hhsr.compiled import Compiled
 from hhsr.kernels import layout as at
 from hhsr.kernels import slab as slab_at
 from hhsr.kernels.slab import lobe_contour, lobe_radius
 from hhsr.kernels.slab_bounds import STEP, lobe_model, lobe_range
 from hhsr.model import Contour, Tree, frozen
-from tests.kernels.small_solids import Z, arithmetic_of_c, ball, band  # noqa: F401
+from tests.kernels.small_solids import Z, arithmetic_of_c, ball, band, coarse  # noqa: F401
 
 AXES = np.array([9.0, 6.0, 7.5, 8.0])
 WAVES = np.array([0.05, -0.1, 0.02, 0.0, 0.08, 0.03, -0.06, 0.04])
@@ -25,10 +26,11 @@ KINDS = {
 }
 
 
+@cache
 def compiled_lobe(kind: str) -> tuple[Compiled, int]:
     """Return a compiled band with one lobe of a kind, and the lobe's record."""
     tree = Tree(band(Z, 0.0, 1.5, (KINDS[kind],), ball(8.0, (0.5, 0, -3)), ball(7.0, (0, 0.4, 3))), frozen(np.zeros(6)))
-    compiled = compile_tree(tree)
+    compiled = coarse(tree).compiled
     ints = compiled.blob.view(np.int64)
     owners = [ints[at.OWNER_INTS] + at.OWNER_INT_SIZE * k for k in range(ints[at.OWNER_COUNT])]
     (slab,) = [ints[o + at.OWNER_RECORD] for o in owners if ints[o + at.OWNER_KIND] == at.SLAB]
